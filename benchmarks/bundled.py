@@ -6,8 +6,6 @@ in ``-paper``. The figure's folder is that run with ``networks.paper``; ``benchm
 command trains nothing.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Bundles on disk, random codes of their models, and a reference that makes times on machines comparable."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Prints a Markdown row for each bundled model and task, measured in this process,
 another code, by one to ten of its vertices.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

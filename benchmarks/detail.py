@@ -75,8 +75,7 @@ class Detail(NamedTuple):
 
 
 def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
-    degrees: FloatArray = np.rad2deg(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
-    return degrees
+    return np.rad2deg(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
 
 
 def rows(name: str, out: Path) -> Iterator[str]:

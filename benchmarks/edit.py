@@ -4,8 +4,6 @@ Pulls a fingertip, an elbow or a knee of the bundled figure to its position on t
 what else moves. The two codes differ in one factor, which moves almost only this limb.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
 
@@ -136,8 +134,7 @@ def _place(
     def place(share: float) -> FloatArray:
         code = start.astype(np.float64)
         code[own] += share * (goal - code[own])
-        position: FloatArray = still(model.decode(code), before, limb)[vertex]
-        return position
+        return still(model.decode(code), before, limb)[vertex]
 
     low, high = 0.0, 1.0
     if np.linalg.norm(place(high) - before[vertex]) < PULL:

@@ -4,8 +4,6 @@
 shapes in FOLDER/NAME.npz, as ``vertices`` (n, V, 3) in the order of the bundle.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -5,8 +5,6 @@ half of it. Exponentials replace networks. Finished folds are kept under ``--out
 folds has its figures in ``runs/folds/``, and is not measured again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Requests over HTTP to a server process, measured by the clock: part of ``python -m benchmarks.serving``."""
 
-from __future__ import annotations
-
 import statistics
 import threading
 import time

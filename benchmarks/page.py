@@ -6,8 +6,6 @@ canvas. Reading back forces the renderer to finish. The benchmark also prints th
 the time from a ready server to the first shape.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time

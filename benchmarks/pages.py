@@ -1,7 +1,5 @@
 """The pages in docs/measurements: their folder, their templates, and their tables in Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

@@ -6,8 +6,6 @@ trains the paper's factor networks and convolutions on them. R² on the run's ow
 page. The command takes an hour on a processor; an interrupted call can be continued.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``python -m benchmarks.pictures CONFIG RUN`` draws them from a finished run, after figures 4 and 5 of the paper.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A server process for benchmarks, and the memory and processor time of processes (Linux)."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

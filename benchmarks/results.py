@@ -5,8 +5,6 @@ Each collection is a run under ``--out``, so a killed call can be continued. Fig
 written next to the runs, since they contain the collections' geometry.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Callable

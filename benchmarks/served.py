@@ -6,8 +6,6 @@ fifth, until each fifth was held out once, or ``--folds`` of them. Results are k
 can be continued. ``python -m benchmarks.fit --data OUT/models`` fits scans of the first fifth.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

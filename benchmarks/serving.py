@@ -7,8 +7,6 @@ comparable. Linear blend shapes (a sum of m fields and the same file) are a lowe
 collections with a tangent space, is an upper bound. ``http`` measures a server process by the clock.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import os

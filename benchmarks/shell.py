@@ -6,8 +6,6 @@ timed in turn with it, because machines and their load differ. Residuals are mea
 every step. Symbolic analysis is done once a collection; it has its own column.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

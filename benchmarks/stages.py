@@ -4,8 +4,6 @@
 size changed at a time. Results are kept under ``--out``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

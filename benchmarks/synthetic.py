@@ -1,7 +1,5 @@
 """Bundles of any size for benchmarks: capsules that bulge, with linear networks written by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Write ``docs/reference/configuration.md``: every setting of a configuration, from the models that read it."""
 
-from __future__ import annotations
-
 import json
 import types
 from collections.abc import Iterator

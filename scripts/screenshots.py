@@ -1,7 +1,5 @@
 """Write the screenshots of the page in docs/, of bundled models: ``python -m scripts.screenshots``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from playwright.sync_api import Page, sync_playwright

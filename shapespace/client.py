@@ -27,71 +27,41 @@ Placement = Mapping[str, Any]
 
 
 class SearchParameters(TypedDict, total=False):
-    """Parameters of every search for a code, as the server describes them.
+    """Parameters of every search for a code, as the server describes them."""
 
-    Attributes:
-        version: version of the model; by default the server's default version.
-        fixed: values of coordinates that the code keeps, by index.
-        samples: number of codes to draw from the posterior.
-        seed: seed of the random numbers.
-    """
-
-    version: str | None
-    fixed: Mapping[int, float] | None
-    samples: int
-    seed: int
+    version: str | None  # version of the model; by default the server's default version
+    fixed: Mapping[int, float] | None  # values of coordinates that the code keeps, by index
+    samples: int  # number of codes to draw from the posterior
+    seed: int  # seed of the random numbers
 
 
 class EncodeParameters(SearchParameters, total=False):
-    """Parameters of ``encode``.
+    """Parameters of ``encode``."""
 
-    Attributes:
-        bounds: "allow", "clamp" or "reject".
-        objective: "vertices" or "nric".
-    """
-
-    bounds: str
-    objective: str
+    bounds: str  # "allow", "clamp" or "reject"
+    objective: str  # "vertices" or "nric"
 
 
 class EditParameters(SearchParameters, total=False):
-    """Parameters of ``edit``.
+    """Parameters of ``edit``."""
 
-    Attributes:
-        prior: weight of changes of the code.
-        prior_kind: "groups" changes few factors, "ridge" all factors a little.
-        mesh: mesh that the vertices belong to, "fine" or "coarse".
-        sigma: standard deviation of targets that have none.
-        anchored: whether only vertices without a target decide where the whole shape lies.
-    """
-
-    prior: float
-    prior_kind: str
-    mesh: str
-    sigma: float | None
-    anchored: bool
+    prior: float  # weight of changes of the code
+    prior_kind: str  # "groups" changes few factors, "ridge" all factors a little
+    mesh: str  # mesh that the vertices belong to, "fine" or "coarse"
+    sigma: float | None  # standard deviation of targets that have none
+    anchored: bool  # whether only vertices without a target decide where the whole shape lies
 
 
 class FitParameters(SearchParameters, total=False):
-    """Parameters of ``fit``.
+    """Parameters of ``fit``."""
 
-    Attributes:
-        scale: "fixed", or "free" if the fit estimates the scan's size.
-        partial: whether the scan shows only a part of the shape.
-        noise: standard deviation of the scan's points.
-        landmarks: vertices with known positions: ``{"vertex", "position", "sigma"}`` each.
-        distribution: "population" or "box".
-        points: whether to return the distance of each point.
-        used: whether to return the points that represented the scan.
-    """
-
-    scale: str
-    partial: bool
-    noise: float | None
-    landmarks: Sequence[Mapping[str, Any]]
-    distribution: str
-    points: bool
-    used: bool
+    scale: str  # "fixed", or "free" if the fit estimates the scan's size
+    partial: bool  # whether the scan shows only a part of the shape
+    noise: float | None  # standard deviation of the scan's points
+    landmarks: Sequence[Mapping[str, Any]]  # vertices with known positions: ``{"vertex", "position", "sigma"}`` each
+    distribution: str  # "population" or "box"
+    points: bool  # whether to return the distance of each point
+    used: bool  # whether to return the points that represented the scan
 
 
 class ClientError(Exception):
@@ -157,13 +127,11 @@ class Client:
 
     def models(self) -> list[dict[str, Any]]:
         """Return every model, in its default version."""
-        models: list[dict[str, Any]] = self._send("GET", "/v1/models").json()["models"]
-        return models
+        return self._send("GET", "/v1/models").json()["models"]
 
     def model(self, name: str, version: str | None = None) -> dict[str, Any]:
         """Return a model's card."""
-        card: dict[str, Any] = self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
-        return card
+        return self._send("GET", f"/v1/models/{name}", params={"version": version}).json()
 
     def mesh(
         self,
@@ -348,8 +316,7 @@ class Client:
         return np.array(answer["latents"])
 
     def _post(self, name: str, call: str, params: Mapping[str, Parameter], **sent: Any) -> dict[str, Any]:
-        answer: dict[str, Any] = self._send("POST", f"/v1/models/{name}/{call}", params=params, **sent).json()
-        return answer
+        return self._send("POST", f"/v1/models/{name}/{call}", params=params, **sent).json()
 
     def _send(
         self, method: str, path: str, *, params: Mapping[str, Parameter] | None = None, **sent: Any

@@ -34,7 +34,6 @@ NO_MATHEMATICS = {
     "shapespace.model.options",
     "shapespace.model.shape_model",
     "shapespace.training.learning.export",
-    "shapespace.training.learning.gallery",
     "shapespace.training.learning.naming",
 }
 

@@ -1,7 +1,5 @@
 """Mesh attributes as bundles and runs store them: arrays by name, an entry with names, and textures as files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
@@ -42,10 +40,8 @@ def surface_entry(surface: MeshAttributes) -> AttributesEntry:
 def from_entry(entry: AttributesEntry, arrays: Mapping[str, NDArray], textures: Mapping[str, bytes]) -> MeshAttributes:
     """Return mesh attributes from an entry, its arrays and its textures.
 
-    This function does not check whether the arrays fit each other and the mesh; `MeshAttributes.check` does.
-
-    Raises:
-        MeshError: an array is missing, or a texture is too large or no picture.
+    This function does not check whether the arrays fit each other and the mesh; `MeshAttributes.check` does. Raises
+    MeshError if an array is missing, or a texture is too large or no picture.
     """
 
     def whole(name: str) -> NDArray | None:

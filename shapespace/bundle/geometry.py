@@ -44,24 +44,17 @@ class FineMesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Content of ``geometry.npz``.
+    """Content of ``geometry.npz``."""
 
-    Attributes:
-        reference: the reference shape, normalised.
-        fine: the fine mesh, if there is one.
-        modes: (m, V, 3) vertex fields d_j at the reference, if codes are coefficients of tangent vectors.
-        training_codes: (n, m) codes of the training shapes, if there are any.
-        file_vertices: (N,) for each vertex of the user's files its vertex of the finest mesh, or −1 if it is in no
-            face; None if the vertices are the same.
-        surface: attributes of the finest mesh in the user's file, if any.
-    """
-
-    reference: TriangleMesh
-    fine: FineMesh | None = None
+    reference: TriangleMesh  # the reference shape, normalised
+    fine: FineMesh | None = None  # the fine mesh, if there is one
+    # (m, V, 3) vertex fields d_j at the reference, if codes are coefficients of tangent vectors
     modes: FloatArray | None = None
-    training_codes: FloatArray | None = None
+    training_codes: FloatArray | None = None  # (n, m) codes of the training shapes, if there are any
+    # (N,) for each vertex of the user's files its vertex of the finest mesh, or −1 if it is in no face; None if the
+    # vertices are the same
     file_vertices: IntArray | None = None
-    surface: MeshAttributes | None = None
+    surface: MeshAttributes | None = None  # attributes of the finest mesh in the user's file, if any
 
     def arrays(self) -> dict[str, NDArray]:
         """Return the arrays of the file by name, in the types of `ARRAYS`."""
@@ -87,8 +80,7 @@ class Geometry:
     ) -> Geometry:
         """Return the geometry in arrays, after checks against each other and the manifest.
 
-        Raises:
-            GeometryError: the message names the file, the array and the fault.
+        Raises GeometryError, whose message names the file, the array and the fault.
         """
         file = manifest.geometry.file
         try:

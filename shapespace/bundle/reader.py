@@ -1,7 +1,5 @@
 """Reader of bundles. It checks every byte against the manifest before it parses a file."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -39,18 +37,13 @@ class BundleError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle(Geometry):
-    """Content of a bundle, verified against its manifest.
-
-    Attributes:
-        manifest: the manifest.
-        digest: SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest
-            identifies every byte of the bundle.
-        networks: content of each ONNX file by name.
-    """
+    """Content of a bundle, verified against its manifest."""
 
     manifest: Manifest
+    # SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest identifies every
+    # byte of the bundle.
     digest: str
-    networks: Mapping[str, bytes]
+    networks: Mapping[str, bytes]  # content of each ONNX file by name
 
 
 def check_place(folder: Path) -> None:
@@ -65,10 +58,8 @@ def manifest_digest(folder: Path) -> str:
 
 
 def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
-    """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given.
-
-    Raises:
-        BundleError: the bundle differs from its manifest, or breaks the schema.
+    """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given. Raises BundleError if the
+    bundle differs from its manifest, or breaks the schema.
     """
     check_place(folder)
     name, version = folder.parent.name, folder.name

@@ -161,14 +161,11 @@ class Manifest(_Strict):
 
 
 class ArrayType(NamedTuple):
-    """Shape and type of an array in ``geometry.npz``.
+    """Shape and type of an array in ``geometry.npz``."""
 
-    Attributes:
-        shape: sizes. The letters m, V, F and E are sizes from the manifest; other letters stand for any size above 0.
-        dtype: type in which the array is written. The reader accepts every real or every whole type, respectively.
-    """
-
+    # Sizes. The letters m, V, F and E are sizes from the manifest; other letters stand for any size above 0.
     shape: tuple[int | str, ...]
+    # Type in which the array is written. The reader accepts every real or every whole type, respectively.
     dtype: type[np.number]
 
 

@@ -1,7 +1,5 @@
 """Writer of bundles. It writes a whole bundle or nothing."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -71,11 +69,8 @@ class Facts:
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
     """Write or replace the bundle ``models/NAME/VERSION/``, and return its folder.
 
-    Equal contents give equal bytes.
-
-    Raises:
-        pydantic.ValidationError: the facts contradict each other or the files. Nothing is written.
-        OSError: the folder can't be written.
+    Equal contents give equal bytes. Raises pydantic.ValidationError if the facts contradict each other or the files;
+    then nothing is written. Raises OSError if the folder can't be written.
     """
     files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
     files |= {COMBINER.file: networks.combiner, GEOMETRY.file: npz_bytes(geometry.arrays(), compressed=False)}
@@ -101,13 +96,10 @@ def entry(content: bytes) -> FileEntry:
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:
     reference = geometry.reference
+    same = ("name", "version", "licence", "title", "description", "eta_reconstruction", "exponential_steps", "scale")
     return Manifest.model_validate({
         "schema_version": SCHEMA_VERSION,
-        "name": facts.name,
-        "version": facts.version,
-        "licence": facts.licence,
-        "title": facts.title,
-        "description": facts.description,
+        **{name: getattr(facts, name) for name in (*same, "draft_error", "origin")},
         "latent_dimension": len(facts.lower),
         "latent_names": list(facts.latent_names),
         "factors": [
@@ -123,16 +115,11 @@ def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> M
         "mu": facts.material.mu,
         "lambda": facts.material.lambda_,
         "eta": facts.material.eta,
-        "eta_reconstruction": facts.eta_reconstruction,
-        "exponential_steps": facts.exponential_steps,
-        "scale": facts.scale,
         "combiner": COMBINER,
         "start": START if START.file in files else None,
         "geometry": GEOMETRY,
         "surface": surface_entry(geometry.surface) if geometry.surface else None,
         "onnx_tolerance": facts.tolerance,
         "figures": dict(facts.figures),
-        "draft_error": facts.draft_error,
-        "origin": facts.origin,
         "files": {name: entry(files[name]) for name in sorted(files)},
     })  # fmt: skip

@@ -15,8 +15,6 @@ angle γ is needed. Its cosine follows from the law of cosines, ``cos γ = (b² 
 ``sin γ/2 = √((1 − cos γ)/2)`` and ``cos γ/2 = √((1 + cos γ)/2)``, without a trigonometric function.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -120,11 +118,8 @@ class FrameIntegration:
         return np.stack([self._poisson.solve(column) for column in right.T], axis=1)
 
     def _face_frames(self, halves: FloatArray, angles: FloatArray) -> FloatArray:
-        """Unit quaternions (4, F) of the face frames.
-
-        Args:
-            halves: (2, 3F) cosines and sines of half the directions of the sides of all faces.
-            angles: (H,) half the angles of the hinges.
+        """Unit quaternions (4, F) of the face frames. ``halves`` (2, 3F) are cosines and sines of half the directions
+        of all sides, ``angles`` (H,) half the angles of the hinges.
         """
         # Across a hinge: rotate its direction α in the left face to the first axis, fold by θ, rotate the first axis to
         # its direction β in the right face, where the edge runs the other way. As quaternions this is z(α) x(θ) z(−β),

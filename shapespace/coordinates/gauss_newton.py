@@ -18,7 +18,7 @@ from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import Backend, Cholesky, Factorisation, NotPositiveDefiniteError, analyse
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.line_search import backtrack, sufficient_decrease
-from shapespace.solve.outcome import Outcome, Status
+from shapespace.solve.outcome import Outcome, Status, limit_reached
 from shapespace.solve.preconditioner import Preconditioner
 
 #: Below this relative misfit factors are computed in single precision, and a first guess is used without trying others.
@@ -101,12 +101,6 @@ class IterationLimits:
     iterations: int  # largest number of iterations, for both kinds together
     deadline: Deadline | None  # no iteration begins after it
 
-    def reached(self, iterations: int) -> Status | None:
-        """Return the limit that is reached after a number of iterations, or None."""
-        if iterations >= self.iterations:
-            return Status.ITERATION_LIMIT
-        return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
-
 
 @dataclass(frozen=True, kw_only=True)
 class Ended(Outcome):
@@ -156,7 +150,7 @@ class GaussNewton:
         """Iterate with a line search for new factors, and with acceleration for reused ones until a step fails."""
         iterations = 0
         factor: _ReusedFactor | None = None
-        while (reached := limits.reached(iterations)) is None:
+        while (reached := limit_reached(iterations, limits.iterations, limits.deadline)) is None:
             new = factor is None
             if factor is None:
                 try:
@@ -207,7 +201,7 @@ class GaussNewton:
         """
         here, iterations, damping = begun.point, begun.iterations, DAMPING.first
         areas = face_areas(here.vertices, self._faces)
-        while (reached := limits.reached(iterations)) is None:
+        while (reached := limit_reached(iterations, limits.iterations, limits.deadline)) is None:
             try:
                 factor = self.double.factorise(self._damped(here.entries(), damping))
                 step = factor.solve(here.forces().ravel()).reshape(-1, 3)
@@ -239,7 +233,6 @@ class GaussNewton:
         return bool(here.energy <= GOOD_MISFIT**2 * self.squares.norm.square(target))
 
     def _damped(self, entries: FloatArray, share: float) -> FloatArray:
-        """Return the entries with the diagonal increased by a share."""
         damped = entries.copy()
         damped[self.squares.matrix.pattern.diagonal] *= 1 + share
         return damped

@@ -1,7 +1,5 @@
 """The matrix ``JᵀHJ``: a quadratic form on lengths and angles, pulled back to vertex positions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

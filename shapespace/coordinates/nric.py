@@ -156,14 +156,10 @@ class WeightedNorm:
 
     ``‖d‖² = Σ (d_l / l̄)² + η Σ (l̄ a^{-1/2} d_θ)²``, with l̄ the lengths of the reference and ``a`` one third of the
     area of the two faces at an edge. Boundary angles have weight 0. The norm is dimensionless.
-
-    Attributes:
-        squared: (2E,) weights of the squared differences, including η.
-        eta: weight η of the angles.
     """
 
-    squared: FloatArray
-    eta: float
+    squared: FloatArray  # (2E,) weights of the squared differences, including η
+    eta: float  # weight η of the angles
 
     @classmethod
     def of(cls, reference: TriangleMesh, eta: float) -> WeightedNorm:
@@ -191,14 +187,11 @@ class NRICGradients:
 
 @dataclass(frozen=True)
 class NRICSecondDerivatives:
-    """The entries of ``D²z(X)``, by components.
+    """The entries of ``D²z(X)``, by components."""
 
-    Attributes:
-        lengths: (3, 3, E) second derivative of each length by its head, and by its tail; the mixed one is the negative.
-        angles: (4, 4, 3, 3, H) second derivatives of each interior angle by the tail, head, left and right vertex.
-    """
-
+    # (3, 3, E) second derivative of each length by its head, and by its tail; the mixed one is the negative
     lengths: FloatArray
+    # (4, 4, 3, 3, H) second derivatives of each interior angle by the tail, head, left and right vertex
     angles: FloatArray
 
 

@@ -1,7 +1,5 @@
 """Unit quaternions as rotations, by components (4, …), scalar part first."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

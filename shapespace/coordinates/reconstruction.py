@@ -34,14 +34,10 @@ class Reconstruction(Outcome):
 
     An iteration is one evaluation of z(X) and one solve. The residual is ``‖z(X) − z*‖ / ‖z*‖`` in the weighted norm,
     about the relative misfit of an edge.
-
-    Attributes:
-        vertices: (V, 3), always finite.
-        flipped_faces: number of faces at edges whose angle differs from the target by more than π/2.
     """
 
-    vertices: FloatArray
-    flipped_faces: int = 0
+    vertices: FloatArray  # (V, 3), always finite
+    flipped_faces: int = 0  # number of faces at edges whose angle differs from the target by more than π/2
 
 
 class Reconstructor:
@@ -50,12 +46,8 @@ class Reconstructor:
     It minimises ``½ ‖z(X) − z*‖²_{2,z̄}`` over X in R^{3V}, with angles modulo 2π, see GaussNewton. The target need not
     be integrable, so any genus and any boundary are possible.
 
-    An instance holds work space: use one per thread.
-
-    Args:
-        reference: mesh that determines the weights, and the default start.
-        eta: weight of the angles, see DEFAULT_ETA.
-        backend: Cholesky backend.
+    An instance holds work space: use one per thread. The reference determines the weights and the default start;
+    ``eta`` weighs the angles, see DEFAULT_ETA.
     """
 
     def __init__(self, reference: TriangleMesh, eta: float = DEFAULT_ETA, backend: Backend = "auto") -> None:
@@ -130,12 +122,8 @@ class Reconstructor:
     ) -> Reconstruction:
         """Reconstruct one shape from a given start.
 
-        Args:
-            target: z*, (2E,); need not be integrable.
-            start: (V, 3) first guess, the reference by default.
-            tolerance: stop once no vertex moves further than this fraction of the reference's diagonal.
-            max_iterations: largest number of steps.
-            deadline: no iteration begins after it.
+        The target z* (2E,) need not be integrable. By default the start (V, 3) is the reference. The steps end once no
+        vertex moves further than ``tolerance`` times the reference's diagonal, and none begins after the deadline.
         """
         here = self._squares(self.reference.vertices if start is None else np.asarray(start, np.float64), target)
         return self._iterate(target, here, tolerance, max_iterations, deadline)

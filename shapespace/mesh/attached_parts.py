@@ -1,7 +1,5 @@
 """Anchors of attached parts: parts of the fine mesh that lie beside the coarse surface, such as eyes and nails."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -30,12 +28,8 @@ def attach_part(
     Each coarse vertex near the part has an affine map, see `Prolongation`. The anchors are the vertices whose maps
     predict the part best in all shapes, weighted by the inverse squares of their errors.
 
-    Args:
-        coarse: the coarse mesh at rest.
-        rest: (k, 3) the part at rest.
-        vertices: (k,) vertices of the part in the fine mesh.
-        shapes: (n, V, 3) coarse shapes.
-        parts: (n, k, 3) the part in these shapes.
+    The part has the vertices (k,) of the fine mesh. It lies at ``rest`` (k, 3), and at ``parts`` (n, k, 3) in the
+    coarse shapes (n, V, 3).
     """
     some = np.unique(np.linspace(0, len(rest) - 1, SAMPLE).astype(int))
     distances = [np.asarray(cKDTree(part).query(shape)[0]) for shape, part in zip(shapes, parts, strict=True)]

@@ -27,20 +27,15 @@ class Topology(StrEnum):
 
 @dataclass(frozen=True)
 class SurfaceMaterial:
-    """The material of a part of a surface.
+    """The material of a part of a surface."""
 
-    Attributes:
-        name: name of the material.
-        color: red, green and blue as linear light, and opacity, each from 0 to 1; multiplied by the texture.
-        metallic, roughness: from 0 to 1.
-        texture: name of the picture of the base colour, or None.
-    """
-
-    name: str
+    name: str  # name of the material
+    # red, green and blue as linear light, and opacity, each from 0 to 1; multiplied by the texture
     color: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    # metallic, roughness: from 0 to 1
     metallic: float = 0.0
     roughness: float = 0.75
-    texture: str | None = None
+    texture: str | None = None  # name of the picture of the base colour, or None
 
 
 class Labels(NamedTuple):
@@ -65,38 +60,26 @@ class MeshAttributes:
 
     P polygons have C corners in total. The corners of one polygon are consecutive.
 
-    Attributes:
-        starts: (P + 1,) first corner of each polygon, then C.
-        corners: (C,) vertex of each corner.
-        uv: (U, 2) texture coordinates, with the origin at the lower left.
-        uv_corners: (C,) index of the texture coordinate of each corner, NONE for none.
-        shading: (C,) labels: corners of one vertex with the same label share one normal. None if all corners of each
-            vertex do.
-        normals: whether the file had normals or smoothing groups.
-        colors: (V, 3) sRGB colours of the vertices, from 0 to 1.
-        objects, groups: names of parts.
-        material_of: (P,) index of the material of each polygon, NONE for none.
-        materials: materials of the surface.
-        textures: picture files by name.
-
     >>> import numpy as np
     >>> square = MeshAttributes(starts=np.array([0, 4]), corners=np.array([0, 1, 3, 2]))
     >>> square.triangles.tolist()
     [[0, 1, 3], [0, 3, 2]]
     """
 
-    starts: IntArray
-    corners: IntArray
-    uv: FloatArray | None = None
-    uv_corners: IntArray | None = None
+    starts: IntArray  # (P + 1,) first corner of each polygon, then C
+    corners: IntArray  # (C,) vertex of each corner
+    uv: FloatArray | None = None  # (U, 2) texture coordinates, with the origin at the lower left
+    uv_corners: IntArray | None = None  # (C,) index of the texture coordinate of each corner, NONE for none
+    # (C,) labels: corners of one vertex with the same label share one normal. None if all corners of each vertex do.
     shading: IntArray | None = None
-    normals: bool = False
-    colors: FloatArray | None = None
+    normals: bool = False  # whether the file had normals or smoothing groups
+    colors: FloatArray | None = None  # (V, 3) sRGB colours of the vertices, from 0 to 1
+    # objects, groups: names of parts
     objects: Labels | None = None
     groups: Labels | None = None
-    material_of: IntArray | None = None
-    materials: tuple[SurfaceMaterial, ...] = ()
-    textures: Mapping[str, bytes] = field(default_factory=dict)
+    material_of: IntArray | None = None  # (P,) index of the material of each polygon, NONE for none
+    materials: tuple[SurfaceMaterial, ...] = ()  # materials of the surface
+    textures: Mapping[str, bytes] = field(default_factory=dict)  # picture files by name
 
     @classmethod
     def of_triangles(cls, faces: IntArray) -> MeshAttributes:

@@ -1,7 +1,5 @@
 """Closest points on triangles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,12 +11,7 @@ from shapespace.mesh.triangle_mesh import vertex_normals
 
 
 class VertexFaces:
-    """The faces around each vertex of a connectivity, in rows of equal length.
-
-    Attributes:
-        faces: (F, 3).
-        around: (V, k) faces at each vertex; the first face is repeated where a vertex has fewer than k.
-    """
+    """The faces (V, k) around each vertex of a connectivity. The first is repeated where a vertex has fewer than k."""
 
     def __init__(self, faces: IntArray, count: int) -> None:
         self.faces = faces
@@ -32,18 +25,13 @@ class VertexFaces:
 
 @dataclass(frozen=True, eq=False)
 class Closest:
-    """Closest points on a surface to n points.
+    """Closest points on a surface to n points."""
 
-    Attributes:
-        distances: (n,).
-        faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there.
-        places: (n, 3) positions.
-    """
-
-    distances: FloatArray
+    distances: FloatArray  # (n,)
+    # faces, barycentric: (n,) faces that contain the closest points, and (n, 3) coordinates there
     faces: IntArray
     barycentric: FloatArray
-    places: FloatArray
+    places: FloatArray  # (n, 3) positions
 
 
 class MeshProximity:

@@ -1,7 +1,5 @@
 """Choose a coarse connectivity for all shapes of a collection: how far to decimate, and which result to take."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,31 +43,21 @@ THINNING = Thinning()
 
 @dataclass(frozen=True)
 class Coarsening:
-    """A coarse connectivity on a subset of the fine vertices.
+    """A coarse connectivity on a subset of the fine vertices."""
 
-    Attributes:
-        fine_index: (V,) fine vertex of each coarse vertex, increasing.
-        faces: (F, 3) in coarse indices.
-        smallest_angle: smallest angle of all faces in all shapes, in radians.
-        folds: number of pairs of neighbouring faces that are folded onto one another in some shape.
-        shrinkage: smallest area of a face in a shape, as a share of the face's geometric mean over all shapes.
-        smallest_area: smallest area of a face in a shape, as a share of the mean over the faces of this shape.
-        specks: number of faces with too small an area or angle in some shape (``triangle_quality``).
-        reason: why the number of vertices differs from the target, or why there are specks; may be empty.
-    """
-
-    fine_index: IntArray
-    faces: IntArray
-    smallest_angle: float
-    folds: int
-    shrinkage: float
+    fine_index: IntArray  # (V,) fine vertex of each coarse vertex, increasing
+    faces: IntArray  # (F, 3) in coarse indices
+    smallest_angle: float  # smallest angle of all faces in all shapes, in radians
+    folds: int  # number of pairs of neighbouring faces that are folded onto one another in some shape
+    shrinkage: float  # smallest area of a face in a shape, as a share of the face's geometric mean over all shapes
+    # smallest area of a face in a shape, as a share of the mean over the faces of this shape
     smallest_area: float = 1.0
-    specks: int = 0
-    reason: str = ""
+    specks: int = 0  # number of faces with too small an area or angle in some shape (``triangle_quality``)
+    reason: str = ""  # why the number of vertices differs from the target, or why there are specks; may be empty
 
 
 def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
-    """Remove vertices until ``target`` are left, the same for all shapes.
+    """Remove vertices of a reference until ``target`` are left, the same for all shapes (n, Vf, 3), n ≥ 0.
 
     Half-edge collapses u → v (Garland and Heckbert 1997, Hoppe 1996) attach the faces of u to v. So every coarse vertex
     is a fine vertex, and the coarse faces have a position in every shape. The cheapest collapse is made first. Its cost
@@ -87,15 +75,8 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     result says what remains.
 
     Each collapse takes a fraction of a millisecond. A large mesh is therefore thinned first, by many collapses at once,
-    in time about linear in its number of vertices. Thinning takes only a few shapes into account.
-
-    Args:
-        fine: the reference.
-        target: number of vertices.
-        shapes: (n, Vf, 3) all shapes of the collection, n ≥ 0.
-
-    Raises:
-        MeshError: the shapes have another number of vertices, or coordinates that are not finite.
+    in time about linear in its number of vertices. Thinning takes only a few shapes into account. Raises MeshError if
+    the shapes have another number of vertices, or coordinates that are not finite.
     """
     shapes = np.asarray(shapes, dtype=np.float64)
     if shapes.ndim != 3 or shapes.shape[1:] != fine.vertices.shape:
@@ -113,7 +94,6 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
 
 
 def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
-    """Decimate with all weights of motion, and return the best result."""
     shapes = np.concatenate([fine.vertices[None], shapes])
     found = [_coarsen(fine, target, shapes, weight) for weight in MOTION_WEIGHTS]
     fewest = min((coarsening.specks, coarsening.folds) for coarsening in found)
@@ -168,7 +148,6 @@ def _result(decimation: Decimation, target: int) -> Coarsening:
 
 
 def _reason(count: int, target: int, specks: int) -> str:
-    """Say what differs from the target, and why."""
     parts = []
     if count != target:
         why = "thin parts that could only be had with slivers are left to the fine mesh"

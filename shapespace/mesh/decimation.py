@@ -1,7 +1,5 @@
 """Decimation of one mesh in all its shapes: half-edge collapses by quadric error, one by one, and edge flips."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,17 +22,14 @@ _Face = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """Faces that a collapse changes, as triples of vertices in ``rows``. All other lists have indices of rows.
-
-    Attributes:
-        staying, new: faces at the collapsed vertex that don't vanish, and these faces after the collapse.
-        pairs_before, pairs_after: neighbours among the old or the new faces and the faces around them.
-    """
+    """Faces that a collapse changes, as triples of vertices in ``rows``. All other lists have indices of rows."""
 
     rows: list[_Face]
     old: list[int]
+    # staying, new: faces at the collapsed vertex that don't vanish, and these faces after the collapse
     staying: list[int]
     new: list[int]
+    # pairs_before, pairs_after: neighbours among the old or the new faces and the faces around them
     pairs_before: Pairs
     pairs_after: Pairs
 
@@ -42,18 +37,10 @@ class _Neighbourhood:
 class Decimation:
     """A mesh during its decimation. See ``coarsening.coarsen`` for the collapses that are refused.
 
-    Args:
-        connectivity: connectivity of the fine mesh with Vf vertices.
-        shapes: (n, Vf, 3).
-        mean_areas: (n,) expected mean area of the coarse faces in each shape.
-        small: length of a small edge. In a crumpled place, a vertex whose faces have no longer side may collapse freely
-            as long as slivers and folds don't become more: the place is about to become a point.
-        motion_weight: weight of the squared distance that a vertex moves, relative to the planes of the faces.
-
-    Attributes:
-        count: number of vertices that are left.
-        faces: remaining faces as triples of fine vertices, by their index in the fine mesh.
-        mean_areas: see the argument.
+    The shapes are (n, Vf, 3), and the coarse faces in each have an expected mean area (n,). In a crumpled place, a
+    vertex whose faces have no side longer than ``small`` may collapse freely as long as slivers and folds don't become
+    more: the place is about to become a point. The squared distance that a vertex moves has the weight
+    ``motion_weight``, relative to the planes of the faces.
     """
 
     def __init__(
@@ -67,6 +54,7 @@ class Decimation:
         self._sample = np.ascontiguousarray(self._points[:, chosen])
         self._monomials = monomials(self._sample)
         self._quadrics, self._areas = quadrics_of(connectivity, centred[chosen])
+        # Remaining faces as triples of fine vertices, by their index in the fine mesh, and number of vertices left.
         self.faces: dict[int, _Face] = {f: (a, b, c) for f, (a, b, c) in enumerate(connectivity.faces.tolist())}
         self.count = connectivity.vertex_count
         self._star: list[set[int]] = [set() for _ in range(self.count)]
@@ -124,8 +112,7 @@ class Decimation:
         bad = np.asarray(((triangles.sines < sine**2) | (triangles.sizes < 1)).any(axis=1))
         if folds:
             bad[folded_pairs(connectivity, triangles.normals).ravel()] = True
-        vertices: list[int] = np.unique(faces[bad]).tolist()
-        return vertices
+        return np.unique(faces[bad]).tolist()
 
     def _costs(self, pairs: IntArray) -> FloatArray:
         u, v = pairs.T

@@ -16,7 +16,14 @@ from scipy.spatial import cKDTree
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import closest_barycentric
 from shapespace.mesh.rigid_motion import align
-from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, diagonal, face_normals
+from shapespace.mesh.triangle_mesh import (
+    Connectivity,
+    MeshError,
+    TriangleMesh,
+    diagonal,
+    face_normals,
+    faces_at_vertices,
+)
 
 #: Weight of a vertex normal relative to the weight of an edge, in the fit of a vertex' local affine map.
 NORMAL_WEIGHT = 0.1
@@ -70,16 +77,11 @@ class Prolongation:
 
     An attached part is bound to its anchors as a whole, so its map is affine. If it is rigid, its rest shape then
     replaces the mapped one, aligned to it.
-
-    Args:
-        faces: (F, 3) faces of the coarse mesh.
-        weights: (Vf, 2V) B beside C.
-        rigid: parts that move rigidly.
     """
 
-    faces: IntArray
-    weights: sp.csr_array
-    rigid: tuple[RigidPart, ...] = ()
+    faces: IntArray  # (F, 3) faces of the coarse mesh
+    weights: sp.csr_array  # (Vf, 2V) B beside C
+    rigid: tuple[RigidPart, ...] = ()  # parts that move rigidly
 
     @classmethod
     def of(cls, coarse: TriangleMesh, fine: TriangleMesh, parts: Sequence[AttachedPart] = ()) -> Prolongation:
@@ -116,11 +118,8 @@ class Prolongation:
         present weights. The ridge is isotropic. Changes of the weights on vertices sum to 0, so that fine vertices
         still follow translations. Fine vertices that coincide with coarse ones keep their weights.
 
-        Args:
-            coarse: (n, V, 3) coarse shapes.
-            fine: (n, Vf, 3) the true fine shapes, each aligned to its coarse shape.
-            rows: (k,) fine vertices whose weights may change.
-            shapes: (l,) indices of the shapes to learn from.
+        The coarse shapes are (n, V, 3), and the true fine shapes (n, Vf, 3) are aligned to them. Only the weights of
+        the fine vertices ``rows`` (k,) change. They are learned from the shapes with indices ``shapes`` (l,).
         """
         count, weights = coarse.shape[1], self.weights
         given = np.stack([self._regressors(y) for y in coarse[shapes]])
@@ -160,17 +159,13 @@ class Prolongation:
 
     @cached_property
     def _around(self) -> sp.csr_array:
-        return _around(self.faces, self.weights.shape[1] // 2)
+        return faces_at_vertices(self.faces, self.weights.shape[1] // 2)
 
     def errors(self, coarse: FloatArray, fine: Iterable[FloatArray]) -> dict[str, float]:
         """Compute the ``mean`` and ``max`` distance to the true fine shapes, over all vertices and shapes.
 
-        Args:
-            coarse: (n, V, 3) shapes.
-            fine: n true fine shapes (Vf, 3).
-
-        Returns:
-            Distances after rigid alignment, as fractions of the diagonal of each shape's bounding box.
+        Distances between n coarse shapes (V, 3), mapped and rigidly aligned, and n true fine shapes (Vf, 3) are
+        fractions of the diagonal of each fine shape's bounding box.
         """
         found = [(distance.mean(), distance.max()) for distance in self.distances(coarse, fine)]
         means, largest = zip(*found, strict=True)
@@ -198,11 +193,9 @@ class Prolongation:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Prolongation:
-        """Read ``arrays()`` back from a mapping, such as an opened NPZ file.
-
-        Raises:
-            ProlongationError: an array is missing, has another shape or type, is out of range or not finite, or the
-                weights of a fine vertex don't sum to 1.
+        """Read ``arrays()`` back from a mapping, such as an opened NPZ file. Raises ProlongationError if an array is
+        missing, has another shape or type, is out of range or not finite, or the weights of a fine vertex don't sum to
+        1.
         """
         faces, weights = _flat(arrays, "faces", np.int64, 2), _flat(arrays, "weights", np.float64, 1)
         indptr, indices = (_flat(arrays, name, np.int64, 1) for name in ("indptr", "indices"))
@@ -240,15 +233,11 @@ def bind_points(
 ) -> sp.csr_array:
     """Weights (k, 2V) that move points (k, 3) with the coarse vertices they are bound to: B beside C of `Prolongation`.
 
-    Args:
-        coarse: the coarse mesh at rest.
-        points: (k, 3) points at rest.
-        rows: (n,) index of a point for each bond.
-        columns: (n,) coarse vertex of each bond.
-        b: (n,) weight of each bond; the weights of one point sum to 1.
+    Each of n bonds has the index of a point in ``rows``, a coarse vertex in ``columns``, and a weight in ``b``. The
+    weights of one point sum to 1.
     """
     count, tail, head = len(coarse.vertices), *np.concatenate([coarse.edges, coarse.edges[:, ::-1]]).T
-    around = _around(coarse.faces, count)
+    around = faces_at_vertices(coarse.faces, count)
     normals = _scaled_normals(coarse.vertices, coarse.faces, around)
 
     # A_j = Σ_k (y_k − y_j) g_jkᵀ + n_j h_jᵀ, the normal equations which are the same for all three coordinates.
@@ -302,20 +291,13 @@ def _flat(arrays: Mapping[str, NDArray], name: str, kind: type[np.number], dimen
     return array.astype(kind)
 
 
-def _around(faces: IntArray, count: int) -> sp.csr_array:
-    """(V, F) sparse matrix with 1 where a vertex belongs to a face."""
-    columns = np.repeat(np.arange(len(faces)), 3)
-    return sp.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
-
-
 def _scaled_normals(vertices: FloatArray, faces: IntArray, around: sp.csr_array) -> FloatArray:
     """(V, 3) vertex normals, as long as the root of twice the area around; 0 where the faces cancel."""
     by_face = face_normals(vertices, faces, normalised=False)
     summed = around @ by_face
     length = np.linalg.norm(summed, axis=1)
     area = around @ np.linalg.norm(by_face, axis=1)
-    scaled: FloatArray = summed * (np.sqrt(area) / np.where(length > 0, length, 1))[:, None]
-    return scaled
+    return summed * (np.sqrt(area) / np.where(length > 0, length, 1))[:, None]
 
 
 def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArray]:
@@ -325,7 +307,7 @@ def _bind(coarse: TriangleMesh, fine: TriangleMesh) -> tuple[IntArray, FloatArra
     bind fingers and lips to their neighbours.
     """
     near = _closest_along_surface(coarse, fine)
-    around = _around(coarse.faces, len(coarse.vertices))
+    around = faces_at_vertices(coarse.faces, len(coarse.vertices))
     two_rings = sp.csr_array((around @ around.T) @ around)
     found = [
         _bind_some(coarse, fine.vertices[k : k + BOUND_VERTICES], near[k : k + BOUND_VERTICES], two_rings)
@@ -365,5 +347,4 @@ def _closest_along_surface(coarse: TriangleMesh, fine: TriangleMesh) -> IntArray
     _, _, source = dijkstra(graph, directed=False, indices=np.unique(seeds), min_only=True, return_predecessors=True)
     # For a component of the fine mesh without a coarse vertex only the distance in space is left.
     in_space = cKDTree(coarse.vertices).query(fine.vertices)[1]
-    closest: IntArray = np.where(source >= 0, owner[source], in_space)
-    return closest
+    return np.where(source >= 0, owner[source], in_space)

@@ -1,7 +1,5 @@
 """Quadric error metrics (Garland and Heckbert 1997) summed over several shapes: the cost of moving a vertex."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 
@@ -22,9 +20,8 @@ def monomials(points: FloatArray) -> FloatArray:
 def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Compute area-weighted squared distances to the planes at each vertex, in all shapes (n, Vf, 3).
 
-    Returns:
-        Quadrics (Vf, 10n), whose dot product with ``monomials`` is the sum over the shapes, and the areas (Vf,) around
-        the vertices, both averaged over the shapes.
+    Returns quadrics (Vf, 10n), whose dot product with ``monomials`` is the sum over the shapes, and the areas (Vf,)
+    around the vertices, both averaged over the shapes.
     """
     count, (i, j) = connectivity.vertex_count, np.triu_indices(4)
     faces, rim = connectivity.faces, connectivity.edges[~connectivity.interior]
@@ -33,8 +30,7 @@ def quadrics_of(connectivity: Connectivity, shapes: FloatArray) -> tuple[FloatAr
 
     def gather(normals: FloatArray, points: FloatArray, weights: FloatArray, at: sparse.csr_array) -> FloatArray:
         plane = np.concatenate([normals, -(normals * points).sum(axis=-1, keepdims=True)], axis=-1)
-        gathered: FloatArray = at @ (plane[:, i] * plane[:, j] * weights[:, None] / len(shapes))
-        return gathered
+        return at @ (plane[:, i] * plane[:, j] * weights[:, None] / len(shapes))
 
     quadrics, areas = np.empty((count, 10 * len(shapes))), np.zeros(len(faces))
     # One shape at a time: the normals of all faces in all shapes take much memory.

@@ -44,11 +44,8 @@ class Placement:
     ) -> Placement:
         """Find the placement that brings points closest to others in weighted least squares (Umeyama 1991).
 
-        Args:
-            points: (n, 3).
-            there: (n, 3) positions in the target frame.
-            weights: (n,), equal by default.
-            scaled: whether the scale is fitted too; otherwise it is 1.
+        Points and their positions ``there`` are (n, 3), weights (n,), equal by default. The scale is 1 unless it is
+        fitted too.
         """
         share = np.full(len(points), 1 / len(points)) if weights is None else weights / weights.sum()
         middle, centre = share @ points, share @ there

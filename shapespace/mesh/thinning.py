@@ -4,8 +4,6 @@ Decimation makes one collapse after the other, each checked in every shape. For 
 takes far too long. They are so close together that the choice among them matters little.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -40,13 +38,8 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
     checks. The cheapest collapses are made, by the quadrics of all shapes (Garland and Heckbert 1997). Choosing
     vertices that cost less than all their neighbours instead would find too few.
 
-    Args:
-        connectivity: F faces on V vertices.
-        shapes: (n, V, 3) a few shapes of similar size; a collapse may neither fold nor flatten any of them.
-        target: number of vertices.
-
-    Returns:
-        The remaining vertices (V'), increasing, and the faces (F', 3) between them.
+    A collapse may neither fold nor flatten any of the shapes (n, V, 3), which are a few of similar size. Returns the
+    remaining vertices (V'), increasing, and the faces (F', 3) between them.
     """
     points = np.ascontiguousarray(np.moveaxis(shapes - shapes.mean(axis=1, keepdims=True), 0, 1))
     quadrics, areas = quadrics_of(connectivity, np.moveaxis(points, 1, 0))
@@ -72,18 +65,14 @@ def thin(connectivity: Connectivity, shapes: FloatArray, target: int) -> tuple[I
 
 
 class _Round:
-    """The mesh at the beginning of a round: its faces and adjacency.
-
-    Attributes:
-        sides: (V, V) index of the face of each half-edge, counted from 1.
-        neighbours: (V, V) number of faces at each edge.
-    """
+    """The mesh at the beginning of a round: its faces and adjacency."""
 
     def __init__(self, faces: IntArray, points: FloatArray) -> None:
         self.faces, self.points, self.count = faces, points, len(points)
         tails, heads = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
         numbers = np.tile(np.arange(1, len(faces) + 1), 3)
         shape = (self.count, self.count)
+        # (V, V) matrices: the index of the face of each half-edge, from 1, and the number of faces at each edge.
         self.sides = sparse.csr_array((numbers, (tails, heads)), shape=shape)
         half = sparse.csr_array((np.ones(len(tails), np.int32), (tails, heads)), shape=shape)
         self.neighbours = sparse.csr_array(half + half.T)
@@ -123,8 +112,7 @@ class _Round:
         common = np.diff(others.indptr)
         few = self.valence <= np.where(self.rim, 1, 3)
         allowed = (common == np.where(inner, 2, 1)) & (others @ few == 0) & ~(self.rim[u] & inner)
-        pairs: IntArray = np.stack([u, v], axis=1)[allowed].astype(np.int64)
-        return pairs
+        return np.stack([u, v], axis=1)[allowed].astype(np.int64)
 
     def stars(self, vertices: IntArray) -> tuple[IntArray, IntArray]:
         """List the faces around some vertices, with the index of the vertex for each face."""

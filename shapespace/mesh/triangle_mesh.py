@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.vectors import components, cross, unit
@@ -21,9 +22,8 @@ class MeshError(ValueError):
 class PlaceError(MeshError):
     """A fault at some vertices or faces, which the caller may count in another way.
 
-    Args:
-        sentence: message with a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``.
-        numbers: indices by name, counted from 0; several indices are written as ``(2, 48)``.
+    The sentence has a field ``{name}`` for each entry of ``numbers``; names of faces begin with ``face``. Numbers are
+    indices by name, counted from 0; several indices are written as ``(2, 48)``.
     """
 
     def __init__(self, sentence: str, numbers: Mapping[str, Sequence[int]]) -> None:
@@ -125,15 +125,6 @@ class Connectivity:
         """Whether there is no boundary edge."""
         return bool(self.interior.all())
 
-    @property
-    def euler_characteristic(self) -> int:
-        """V − E + F: 2 − 2g − b of a connected surface with g handles and b boundary loops.
-
-        >>> Connectivity([[0, 1, 2], [2, 1, 3]], 4).euler_characteristic
-        1
-        """
-        return self.vertex_count - self.edge_count + len(self.faces)
-
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
@@ -220,9 +211,13 @@ def face_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Compute the areas (V,) of the vertices of a shape (V, 3): a third of each face around."""
     thirds = np.repeat(face_areas(vertices, faces) / 3, 3)
-    areas = np.zeros(len(vertices))
-    np.add.at(areas, faces.ravel(), thirds)
-    return areas
+    return np.bincount(faces.ravel(), thirds, minlength=len(vertices)).astype(np.float64, copy=False)
+
+
+def faces_at_vertices(faces: IntArray, count: int) -> sparse.csr_array:
+    """Return the matrix (V, F) with 1 where a vertex belongs to a face, for `count` vertices."""
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return sparse.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
 def on_shared_vertices(
@@ -259,12 +254,9 @@ def vertex_normals(
 
     A normal is zero where the normals of the faces around cancel.
 
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-        corners: (F, 3) index of the normal at each corner. By default N = V and a corner has the normal of its vertex.
-        order: order of the summation, face by face (C) or corner by corner (F). Their results differ by rounding; files
-            and fits each keep the order of version 0.2.
+    ``corners`` (F, 3) has the index of the normal at each corner. By default N = V and a corner has the normal of its
+    vertex. Sums are computed face by face (``order`` C) or corner by corner (F). Their results differ by rounding;
+    files and fits each keep the order of version 0.2.
     """
     x = components(vertices)
     a, b, c = (x.take(k, axis=1) for k in np.ascontiguousarray(faces.T))

@@ -40,21 +40,14 @@ class TriangleQuality:
 
 @dataclass(frozen=True)
 class Triangles:
-    """Measures of k faces in n shapes.
+    """Measures of k faces in n shapes."""
 
-    Attributes:
-        sines: (k, n) sin² of the smallest angle.
-        normals: (k, n, 3) unit normals.
-        squares: (3, k, n) squared sides.
-        areas: (k, n) areas, as shares of the mean area of a coarse face.
-        sizes: (k, n) the smaller of area and smallest sine, each as a multiple of its limit. A face below 1 is a speck:
-            geodesics between the shapes fail there.
-    """
-
-    sines: FloatArray
-    normals: FloatArray
-    squares: FloatArray
-    areas: FloatArray
+    sines: FloatArray  # (k, n) sin² of the smallest angle
+    normals: FloatArray  # (k, n, 3) unit normals
+    squares: FloatArray  # (3, k, n) squared sides
+    areas: FloatArray  # (k, n) areas, as shares of the mean area of a coarse face
+    # (k, n) the smaller of area and smallest sine, each as a multiple of its limit. A face below 1 is a speck:
+    # geodesics between the shapes fail there.
     sizes: FloatArray
 
     @classmethod

@@ -4,8 +4,6 @@ Arrays are (…, 3), or (3, …) where a name says *by components*: whole arrays
 compute with than rows of three.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

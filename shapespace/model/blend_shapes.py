@@ -1,7 +1,5 @@
 """Linear blend shapes of a model, for programs without networks, and their error against the model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -65,14 +63,8 @@ def require_ends(model: Decoder) -> None:
 def blend_shapes(model: Decoder, mesh: MeshChoice, shape: Callable[[Codes], Shape]) -> BlendShapes:
     """Compute the blend shapes of a model.
 
-    Args:
-        model: decoder of a model without angles.
-        mesh: fine or coarse mesh.
-        shape: function from a code (m,) to its shape on this mesh.
-
-    Raises:
-        PeriodicError: the model has angles.
-        NotFiniteError, ModelFailedError: the model has no shape for a code.
+    ``shape`` computes the shape of a code (m,) on this mesh. Raises PeriodicError if the model has angles, and
+    NotFiniteError or ModelFailedError if it has no shape for a code.
     """
     require_ends(model)
     latents, m = model.latents, model.latents.dimension

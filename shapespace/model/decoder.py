@@ -1,7 +1,5 @@
 """Decoding: networks turn latent codes into lengths and angles, and Gauss–Newton turns these into vertices."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading
@@ -116,13 +114,9 @@ class Decoder:
     Each code is decoded separately, and Gauss–Newton begins at fixed starts, so a shape does not depend on other
     codes.
 
-    Args:
-        bundle: verified bundle.
-        threads: number of shapes that may be reconstructed at once, each with its own solver. The first solver is made
-            here, other solvers when they are needed, which takes about as long as a shape.
-
-    Raises:
-        BundleError: a network doesn't load, or its inputs or outputs differ from the manifest.
+    Up to ``threads`` shapes may be reconstructed at once, each with its own solver. The first solver is made here,
+    others when they are needed, which takes about as long as a shape. Raises BundleError if a network doesn't load, or
+    its inputs or outputs differ from the manifest.
     """
 
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
@@ -191,16 +185,11 @@ class Decoder:
     ) -> Shape:
         """Decode one code (m,), even if Gauss–Newton does not converge: the diagnostics say so.
 
-        Args:
-            code: code from ``latents.codes``.
-            inside_bounds: whether the code lies inside the bounds, for the diagnostics.
-            mesh: fine or coarse mesh.
-            deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
-            quality: a draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless.
+        A draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless. After the
+        deadline Gauss–Newton stops with Status.DEADLINE. ``inside_bounds`` is for the diagnostics.
 
-        Raises:
-            NotFiniteError: the code is so far outside the bounds that numbers overflow.
-            ModelFailedError: the networks failed at this code, or took too long.
+        Raises NotFiniteError if the code is so far outside the bounds that numbers overflow, and ModelFailedError if
+        the networks failed at this code, or took too long.
         """
         began = time.perf_counter()
         _, target = self._networks(code[None])
@@ -274,10 +263,8 @@ class Decoder:
             return self._start(codes, until).astype(np.float64)
 
     def self_test(self) -> None:
-        """Run every network at the ends of the bounds and between them, and reconstruct one shape.
-
-        Raises:
-            BundleError: something fails, so the bundle must not be served.
+        """Run every network at the ends of the bounds and between them, and reconstruct one shape. Raises BundleError
+        if something fails, so the bundle must not be served.
         """
         for network in (*self._factors, self._combiner, *([self._start] if self._start else [])):
             network.check()

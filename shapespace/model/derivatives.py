@@ -48,24 +48,16 @@ def carried(
 ) -> FloatArray:
     """Differentiate a function of a shape, for example alignment and prolongation, by differences.
 
-    Args:
-        model: decoder of the shape.
-        place: function from shapes (…, V, 3) to points (…, k, 3).
-        shape: (V, 3) normalised shape.
-        fields: (m, V, 3) changes of the shape.
-
-    Returns:
-        (m, k, 3) derivatives along the fields.
+    ``place`` maps shapes (…, V, 3) to points (…, k, 3). Returns derivatives (m, k, 3) at a normalised shape (V, 3),
+    along fields (m, V, 3).
     """
     h = SMALL_MOVE * model.reference.diagonal / max(np.abs(fields).max(), np.finfo(float).tiny)
-    result: FloatArray = (place(shape + h * fields) - place(shape)) / h
-    return result
+    return (place(shape + h * fields) - place(shape)) / h
 
 
 def _steps(model: Decoder) -> FloatArray:
     latents = model.latents
-    steps: FloatArray = np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
-    return steps
+    return np.where(latents.periodic, PERIODIC_DIFFERENCE, DIFFERENCE) * latents.width
 
 
 def nodes(model: Decoder, j: int) -> FloatArray:
@@ -93,23 +85,14 @@ class FactorGrids:
 
     Each length or angle, weighted by its norm, is added with a random sign to one of SKETCH sums (a count sketch:
     Charikar, Chen and Farach-Colton 2002), which takes a tenth of the memory.
-
-    Attributes:
-        images: for each factor, sketches (n, SKETCH) of ``ψ_j − z̄`` at its nodes.
     """
 
-    images: dict[int, FloatArray]
+    images: dict[int, FloatArray]  # for each factor, sketches (n, SKETCH) of ``ψ_j − z̄`` at its nodes
     _matrix: sparse.csr_array
 
     @classmethod
     def of(cls, model: Decoder, centre: FloatArray, root: FloatArray) -> FactorGrids:
-        """Run the factors of a model on their grids.
-
-        Args:
-            model: decoder of the factors.
-            centre: z̄ (2E,).
-            root: (2E,) square roots of the norm's weights.
-        """
+        """Run the factors of a model on their grids, given z̄ (2E,) and roots (2E,) of the norm's weights."""
         rng = np.random.default_rng(0)
         signs, sums = rng.choice([-1.0, 1.0], len(root)), rng.integers(SKETCH, size=len(root))
         matrix = sparse.csr_array((signs, (sums, np.arange(len(root)))), shape=(SKETCH, len(root)))
@@ -122,5 +105,4 @@ class FactorGrids:
 
     def sketch(self, weighted: FloatArray) -> FloatArray:
         """Return the sketch (SKETCH,) of a weighted difference (2E,) of NRIC."""
-        sums: FloatArray = self._matrix @ weighted
-        return sums
+        return self._matrix @ weighted

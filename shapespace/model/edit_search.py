@@ -1,7 +1,5 @@
 """The search of an edit: quadratic upper bounds of its objective, minimised one after another from several starts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,39 +19,31 @@ from shapespace.solve.outcome import Status
 
 @dataclass(frozen=True)
 class EditSettings:
-    """Weights and limits of an edit. Lengths are fractions of the reference's diagonal.
+    """Weights and limits of an edit. Lengths are fractions of the reference's diagonal."""
 
-    Attributes:
-        sigma: standard deviation of a target that has none.
-        least_sigma: smallest standard deviation of a target.
-        still: weight of the mean movement of all vertices against the targets' distances.
-        small: length beyond which the cost of movement grows linearly instead of quadratically, so that a limb that has
-            to move can move.
-        unmoved: length added to the norm of each factor's change, as a share of the bounds' width, before the factor's
-            weight is computed. Without it an unchanged factor would have an infinite weight.
-        rough_rounds, solved_rounds: maximum number of bounds that are minimised, with rough and with solved shapes.
-        settled: rounds end when no coordinate moves by more than this share of the bounds' width.
-        starts: maximum number of other starts.
-        rough_misfit, solved_misfit: the search tries other starts while the misfit is larger than this length, with
-            rough and with solved shapes.
-        promising: another result replaces the best one only if it leaves at most this share of the reducible cost.
-        ranked: maximum number of targets that take part in choosing another start; each costs three linear solves.
-        rough_shapes, solved_shapes: maximum number of shapes in a round. A longer search rarely improves the result.
-    """
-
-    sigma: float = 5e-3
-    least_sigma: float = 1e-6
-    still: float = 3e-2
+    sigma: float = 5e-3  # standard deviation of a target that has none
+    least_sigma: float = 1e-6  # smallest standard deviation of a target
+    still: float = 3e-2  # weight of the mean movement of all vertices against the targets' distances
+    # length beyond which the cost of movement grows linearly instead of quadratically, so that a limb that has to move
+    # can move
     small: float = 1e-2
+    # Length added to the norm of each factor's change, as a share of the bounds' width, before the factor's weight is
+    # computed. Without it an unchanged factor would have an infinite weight.
     unmoved: float = 3e-3
+    # rough_rounds, solved_rounds: maximum number of bounds that are minimised, with rough and with solved shapes
     rough_rounds: int = 8
     solved_rounds: int = 2
-    settled: float = 2e-3
-    starts: int = 4
+    settled: float = 2e-3  # rounds end when no coordinate moves by more than this share of the bounds' width
+    starts: int = 4  # maximum number of other starts
+    # rough_misfit, solved_misfit: the search tries other starts while the misfit is larger than this length, with rough
+    # and with solved shapes
     rough_misfit: float = 2e-2
     solved_misfit: float = 2e-3
+    # another result replaces the best one only if it leaves at most this share of the reducible cost
     promising: float = 0.9
+    # maximum number of targets that take part in choosing another start; each costs three linear solves
     ranked: int = 32
+    # rough_shapes, solved_shapes: maximum number of shapes in a round. A longer search rarely improves the result.
     rough_shapes: int = 3
     solved_shapes: int = 8
 
@@ -63,35 +53,23 @@ SETTINGS = EditSettings()
 
 @dataclass(frozen=True, eq=False)
 class QuadraticBound:
-    """Weights of a quadratic upper bound of the objective that is tight at one code.
+    """Weights of a quadratic upper bound of the objective that is tight at one code."""
 
-    Attributes:
-        points: (k + V,) weights of squared distances: of vertices from their targets, and of coarse vertices from their
-            positions at the start. Distances are normalised.
-        code: (m,) weights of squared changes of the code.
-    """
-
+    # (k + V,) weights of squared distances: of vertices from their targets, and of coarse vertices from their positions
+    # at the start. Distances are normalised.
     points: FloatArray
-    code: FloatArray
+    code: FloatArray  # (m,) weights of squared changes of the code
 
 
 @dataclass(frozen=True, eq=False)
 class EditCandidate:
-    """A code at which a descent ended.
+    """A code at which a descent ended."""
 
-    Attributes:
-        x: (m,) code.
-        cost: value of the objective.
-        misfit: root mean square distance from the targets, weighted by their sigmas, as a fraction of the diagonal.
-        status: how the descent ended.
-        bound: quadratic bound that is tight at x.
-    """
-
-    x: FloatArray
-    cost: float
-    misfit: float
-    status: Status
-    bound: QuadraticBound
+    x: FloatArray  # (m,) code
+    cost: float  # value of the objective
+    misfit: float  # root mean square distance from the targets, weighted by their sigmas, as a fraction of the diagonal
+    status: Status  # how the descent ended
+    bound: QuadraticBound  # quadratic bound that is tight at x
 
 
 class EditSearch:
@@ -100,16 +78,8 @@ class EditSearch:
     It minimises the objective twice. Rough shapes cost at most a third of solved shapes and differ from them by about
     half a percent of the diagonal. From the result with rough shapes, a few solved shapes suffice.
 
-    Args:
-        decoder: decoder of the model.
-        rough, pulled: positions of rough shapes and of solved shapes.
-        start: (m,) start, with fixed values inserted.
-        here: (k + V, 3) positions of the start's shape.
-        positions, sigmas: normalised positions (k, 3) of the targets, and their standard deviations (k,) as fractions
-            of the diagonal.
-        options: options of the edit.
-        fixed: coordinates that keep their value.
-        deadline: time limit of the descents.
+    The start (m,) has the fixed values inserted, and ``here`` (k + V, 3) are the positions of its shape. The targets'
+    ``positions`` (k, 3) are normalised, and their ``sigmas`` (k,) are fractions of the diagonal.
     """
 
     def __init__(
@@ -158,7 +128,6 @@ class EditSearch:
         return Placement.between(points, self._goals, self._aligned(bound))
 
     def _aligned(self, bound: QuadraticBound) -> FloatArray:
-        """Return the weights (k + V,) by which a shape is placed."""
         if not self._options.anchored:
             return bound.points
         return np.concatenate([np.zeros(self._count), bound.points[self._count :]])
@@ -191,7 +160,6 @@ class EditSearch:
     def _descend(
         self, x: FloatArray, pulled: PulledVertices, stopping: Stopping, rounds: int, *, secant: bool
     ) -> EditCandidate:
-        """Minimise quadratic bounds one after another, each from the minimum of the last."""
         x = np.clip(x, self._box.lower, self._box.upper)
         bound = self._bound(x, pulled)
         for _ in range(rounds):
@@ -205,7 +173,6 @@ class EditSearch:
     def _fit(
         self, x: FloatArray, pulled: PulledVertices, bound: QuadraticBound, stopping: Stopping, *, secant: bool
     ) -> Fit:
-        """Minimise one quadratic bound by least squares."""
         held = np.sqrt(bound.code)
 
         def residuals(x: FloatArray) -> FloatArray:
@@ -224,7 +191,6 @@ class EditSearch:
         return least_squares(residuals, jacobian, x, self._box, stopping, secant=secant)
 
     def _candidate(self, x: FloatArray, pulled: PulledVertices, bound: QuadraticBound, status: Status) -> EditCandidate:
-        """Evaluate the objective at a code."""
         away = self._misfits(pulled.positions(x), pulled, bound)[1] / self._size
         square = (away**2).sum(axis=1)
         misfit = float(self._pull @ square[: self._count])

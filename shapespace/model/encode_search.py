@@ -1,7 +1,5 @@
 """The search of ``encode``: first by lengths and angles, then by vertices, with restarts from training shapes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,37 +21,22 @@ from shapespace.solve.outcome import Status
 
 @dataclass(frozen=True)
 class EncodeSettings:
-    """Limits of the search of ``encode``. Changes of a code are shares of the bounds' width.
+    """Limits of the search of ``encode``. Changes of a code are shares of the bounds' width."""
 
-    Attributes:
-        sweeps: maximum number of sweeps over the factors; a sweep moves one factor at a time on its grid.
-        promising: a move must explain this many times as much of the misfit as the present place.
-        tolerance: the search by vertices ends when no coordinate would move by more than this,
-        gain: or when the sum of squares would fall by less than this share,
-        shapes: or after this number of shapes.
-        long: a search that takes this many shapes, or meets a nearly collapsed shape, restarts from a training shape,
-        fewest: if at least this many shapes remain,
-        different: and the code there differs by more than this.
-        known: maximum number of training shapes for restarts.
-        candidates: number of nearest training shapes whose lengths and angles are compared.
-        margin: how far outside the bounds a code may lie where ``bounds`` allows it.
-        inside: additional shapes for finding a code inside the bounds that is as near.
-        as_near: a code inside the bounds is preferred if its distance is at most this many times as large.
-    """
-
-    sweeps: int = 4
-    promising: float = 1.2
-    tolerance: float = 1e-4
-    gain: float = 1e-4
-    shapes: int = 25
+    sweeps: int = 4  # maximum number of sweeps over the factors; a sweep moves one factor at a time on its grid
+    promising: float = 1.2  # a move must explain this many times as much of the misfit as the present place
+    tolerance: float = 1e-4  # the search by vertices ends when no coordinate would move by more than this,
+    gain: float = 1e-4  # or when the sum of squares would fall by less than this share,
+    shapes: int = 25  # or after this number of shapes
+    # a search that takes this many shapes, or meets a nearly collapsed shape, restarts from a training shape,
     long: int = 10
-    fewest: int = 3
-    different: float = 0.01
-    known: int = 512
-    candidates: int = 5
-    margin: float = 0.5
-    inside: int = 3
-    as_near: float = 1.02
+    fewest: int = 3  # if at least this many shapes remain,
+    different: float = 0.01  # and the code there differs by more than this
+    known: int = 512  # maximum number of training shapes for restarts
+    candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
+    margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it
+    inside: int = 3  # additional shapes for finding a code inside the bounds that is as near
+    as_near: float = 1.02  # a code inside the bounds is preferred if its distance is at most this many times as large
 
 
 SETTINGS = EncodeSettings()
@@ -61,15 +44,10 @@ SETTINGS = EncodeSettings()
 
 @dataclass(frozen=True)
 class VertexObjective:
-    """Weighted vertex distances from a mesh, after rigid alignment.
+    """Weighted vertex distances from a mesh, after rigid alignment."""
 
-    Attributes:
-        vertices: (V, 3) vertices of the mesh, coarse and normalised.
-        shares: (V,) weights with sum 1.
-    """
-
-    vertices: FloatArray
-    shares: FloatArray
+    vertices: FloatArray  # (V, 3) vertices of the mesh, coarse and normalised
+    shares: FloatArray  # (V,) weights with sum 1
 
     def place(self, shape: FloatArray) -> Placement:
         """Return the rigid motion that brings a shape (V, 3) closest to the mesh."""
@@ -86,19 +64,13 @@ class VertexObjective:
 
 
 class EncodePreparation:
-    """Quantities that the search needs for every mesh of a model; made once.
-
-    Attributes:
-        norm: weighted norm of lengths and angles at the reference.
-        root: (2E,) square roots of its weights.
-        centre: (2E,) lengths and angles of the reference, z̄.
-    """
+    """Quantities that the search needs for every mesh of a model; made once."""
 
     def __init__(self, decoder: Decoder) -> None:
         self.decoder = decoder
         self.norm = WeightedNorm.of(decoder.reference, decoder.manifest.eta_reconstruction)
         self.root = np.sqrt(self.norm.squared)
-        self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)
+        self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)  # z̄
 
     @cached_property
     def grids(self) -> FactorGrids:
@@ -116,15 +88,8 @@ class EncodePreparation:
 
 
 class EncodeSearch:
-    """Search for the code of one mesh.
-
-    Args:
-        prepared: quantities of the model.
-        target: (2E,) lengths and angles of the mesh, normalised.
-        aim: vertices of the mesh.
-        fixed: coordinates that keep their value.
-        bounds: whether the code may lie outside the bounds.
-        deadline: time limit.
+    """Search for the code of one mesh. The target (2E,) has its lengths and angles, normalised, and the aim its
+    vertices.
     """
 
     def __init__(

@@ -1,7 +1,5 @@
 """Exact shapes: the discrete exponentials that the networks approximate."""
 
-from __future__ import annotations
-
 import queue
 from dataclasses import dataclass
 
@@ -24,16 +22,12 @@ class NoTangentSpaceError(ValueError):
 
 @dataclass(frozen=True)
 class ExactShape:
-    """Discrete exponential of one code.
+    """Discrete exponential of one code."""
 
-    Attributes:
-        status: how the solver ended.
-        vertices: (V, 3) float32, aligned to the reference, in the units of the training meshes; None if it failed.
-        mean, max: distance of the networks' shape from ``vertices``; None if it failed.
-    """
-
-    status: Status
+    status: Status  # how the solver ended
+    # (V, 3) float32, aligned to the reference, in the units of the training meshes; None if it failed
     vertices: NDArray[np.float32] | None
+    # mean, max: distance of the networks' shape from ``vertices``; None if it failed
     mean: float | None
     max: float | None
 
@@ -53,12 +47,8 @@ def exact_shape(
 ) -> ExactShape:
     """Compute the exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
 
-    Args:
-        model: decoder of a model with a tangent space.
-        code: (m,) code.
-        answer: (V, 3) shape that the networks give for the code, on the mesh of choice.
-        mesh: fine or coarse mesh.
-        deadline: time limit after which the status is Status.DEADLINE.
+    The networks give the shape ``answer`` (V, 3) for the code (m,), on the mesh of choice. After the deadline the
+    status is Status.DEADLINE.
     """
     modes, steps = require_tangent_space(model)
     velocity = np.tensordot(code.astype(np.float64), modes, axes=1)

@@ -21,28 +21,17 @@ MARGIN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class FitConstraints:
-    """What a fit knows beside the scan. Lengths are in the model's normalised units.
+    """What a fit knows beside the scan. Lengths are in the model's normalised units."""
 
-    Attributes:
-        partial: whether the scan shows only a part of the shape.
-        free: whether the fit estimates the scan's size.
-        noise: standard deviation of the scan's points; None if the fit estimates it.
-        landmarks: (l,) vertices of the fine mesh.
-        places: (l, 3) positions of the landmarks.
-        sigmas: (l,) standard deviations of the positions; infinite for the default share of the diagonal.
-        movable: (m,) whether a coordinate may change.
-        prior: distribution of codes.
-        lower, upper: (m,) limits of codes.
-    """
-
-    partial: bool
-    free: bool
-    noise: float | None
-    landmarks: IntArray
-    places: FloatArray
-    sigmas: FloatArray
-    movable: NDArray[np.bool_]
-    prior: Population
+    partial: bool  # whether the scan shows only a part of the shape
+    free: bool  # whether the fit estimates the scan's size
+    noise: float | None  # standard deviation of the scan's points; None if the fit estimates it
+    landmarks: IntArray  # (l,) vertices of the fine mesh
+    places: FloatArray  # (l, 3) positions of the landmarks
+    sigmas: FloatArray  # (l,) standard deviations of the positions; infinite for the default share of the diagonal
+    movable: NDArray[np.bool_]  # (m,) whether a coordinate may change
+    prior: Population  # distribution of codes
+    # lower, upper: (m,) limits of codes
     lower: FloatArray
     upper: FloatArray
 

@@ -29,25 +29,15 @@ class FitStatus(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class FitState:
-    """Intermediate result of a fit.
+    """Intermediate result of a fit."""
 
-    Attributes:
-        code: (m,) code.
-        shape: (V, 3) coarse shape of the code, in the frame that ``placement`` takes to the scan's frame.
-        placement: placement of the shape in the scan's frame.
-        sigma: standard deviation of the distances of pairs that count, normal to the surface.
-        cost: robust share of scan and model that is not explained, plus the cost of the code.
-        settled: whether the last step was short enough to be the last one.
-        moved: largest movement of the shape in the last step, as a fraction of the diagonal.
-    """
-
-    code: FloatArray
-    shape: FloatArray
-    placement: Placement
-    sigma: float = np.inf
-    cost: float = np.inf
-    settled: bool = False
-    moved: float = np.inf
+    code: FloatArray  # (m,) code
+    shape: FloatArray  # (V, 3) coarse shape of the code, in the frame that ``placement`` takes to the scan's frame
+    placement: Placement  # placement of the shape in the scan's frame
+    sigma: float = np.inf  # standard deviation of the distances of pairs that count, normal to the surface
+    cost: float = np.inf  # robust share of scan and model that is not explained, plus the cost of the code
+    settled: bool = False  # whether the last step was short enough to be the last one
+    moved: float = np.inf  # largest movement of the shape in the last step, as a fraction of the diagonal
 
 
 @dataclass(frozen=True, eq=False)

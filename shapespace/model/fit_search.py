@@ -1,7 +1,5 @@
 """The search of a fit: robust weights, and joint Gauss–Newton steps of code, motion and size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -28,39 +26,28 @@ from shapespace.solve.deadline import Deadline
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Weights and limits of the search. Lengths are fractions of the reference's diagonal.
+    """Weights and limits of the search. Lengths are fractions of the reference's diagonal."""
 
-    Attributes:
-        width: the robust weight of a pair is one half at this distance, in standard deviations of the distances.
-        farthest: quantile of all distances that is the first such distance.
-        shrinking: factor by which this distance shrinks in each iteration.
-        sliding, last_sliding: weight of the point-to-point distance against the point-to-plane distance, at first and
-            later. It keeps a shape from sliding along its own surface.
-        longest: longest step, in standard deviations of the population.
-        turn: largest rotation in a step, in radians.
-        shortest: a shorter step ends the search, in standard deviations of the population,
-        still: and so does a movement of the shape by less than this length.
-        kept: derivatives are used again until the code has moved this far, in standard deviations of the population.
-        landmark: default standard deviation of a landmark.
-        near: points within this distance of the model count as explained; at most twice this distance with noise.
-        compared: where fits are compared, a point at this distance counts as half explained.
-        plausible: weight of the code's plausibility in that comparison. Four standard deviations cost as much as
-            leaving 16 times this share of the scan unexplained.
-    """
-
+    # the robust weight of a pair is one half at this distance, in standard deviations of the distances
     width: float = 3.0
-    farthest: float = 0.95
-    shrinking: float = 0.7
+    farthest: float = 0.95  # quantile of all distances that is the first such distance
+    shrinking: float = 0.7  # factor by which this distance shrinks in each iteration
+    # sliding, last_sliding: weight of the point-to-point distance against the point-to-plane distance, at first and
+    # later. It keeps a shape from sliding along its own surface.
     sliding: float = 0.3
     last_sliding: float = 0.01
-    longest: float = 1.5
-    turn: float = 0.5
-    shortest: float = 0.01
-    still: float = 2e-4
+    longest: float = 1.5  # longest step, in standard deviations of the population
+    turn: float = 0.5  # largest rotation in a step, in radians
+    shortest: float = 0.01  # a shorter step ends the search, in standard deviations of the population,
+    still: float = 2e-4  # and so does a movement of the shape by less than this length
+    # derivatives are used again until the code has moved this far, in standard deviations of the population
     kept: float = 0.3
-    landmark: float = 0.01
+    landmark: float = 0.01  # default standard deviation of a landmark
+    # points within this distance of the model count as explained; at most twice this distance with noise
     near: float = 0.01
-    compared: float = 0.02
+    compared: float = 0.02  # where fits are compared, a point at this distance counts as half explained
+    # Weight of the code's plausibility in that comparison. Four standard deviations cost as much as leaving 16 times
+    # this share of the scan unexplained.
     plausible: float = 0.001
 
 
@@ -69,20 +56,14 @@ SETTINGS = SearchSettings()
 
 @dataclass(frozen=True)
 class SearchAccuracy:
-    """How accurately a search computes shapes.
+    """How accurately a search computes shapes."""
 
-    Attributes:
-        rough: shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the
-            fine mesh with derivatives of the composite.
-        points: number of points of the scan, and of vertices of the model, that count.
-        floor: smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes.
-        independent: share of the points that count as independent observations.
-    """
-
+    # shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the fine
+    # mesh with derivatives of the composite
     rough: bool
-    points: int
-    floor: float
-    independent: float
+    points: int  # number of points of the scan, and of vertices of the model, that count
+    floor: float  # smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes
+    independent: float  # share of the points that count as independent observations
 
     @property
     def mesh(self) -> MeshChoice:
@@ -97,18 +78,8 @@ SOLVED = SearchAccuracy(False, 4000, 3e-4, 0.5)
 class FitSearch:
     """Search for the code and the placement of a shape near a start, with the derivatives of ``encode`` and ``edit``.
 
-    Args:
-        decoder: decoder of the model.
-        reconstruct: solver that the decoder has lent.
-        scan: scan in the model's normalised units.
-        constraints: what the fit knows beside the scan.
-        accuracy: how accurately shapes are computed.
-        vertex_faces: faces around the vertices of the mesh of this accuracy.
-        vertices: evenly spread vertices of the mesh that look for points of the scan.
-        deadline: no step begins after this time limit.
-
-    Attributes:
-        count: number of shapes computed so far.
+    The decoder has lent the solver. The scan is in the model's normalised units. Some evenly spread ``vertices`` of the
+    mesh of this accuracy look for points of the scan. No step begins after the deadline.
     """
 
     def __init__(
@@ -133,7 +104,7 @@ class FitSearch:
         self._changes: Callable[[Decoder, FloatArray], FloatArray] = (
             factor_derivatives if accuracy.rough else derivatives
         )
-        self.count = 0
+        self.count = 0  # number of shapes computed so far
         self._fields: tuple[FloatArray, FloatArray] | None = None
 
     def start(self, code: FloatArray, placement: Placement, like: FloatArray) -> FitState | None:
@@ -144,11 +115,8 @@ class FitSearch:
     def run(self, state: FitState, steps: int, *, first: bool, drawn: int = 0) -> FitState:
         """Take steps from a state.
 
-        Args:
-            state: state to begin at.
-            steps: maximum number of steps.
-            first: whether the first steps also consider distant points.
-            drawn: number of first steps in which unmatched parts of both sides attract each other.
+        With ``first``, the first steps also consider distant points. In the first ``drawn`` steps, unmatched parts of
+        both sides attract each other.
         """
         width, self._fields = np.inf if first else 0.0, None
         for k in range(steps):
@@ -245,8 +213,7 @@ class FitSearch:
 
     def _away(self, code: FloatArray) -> FloatArray:
         """Return the scores (m,) of a code in the prior, angles the shorter way round."""
-        scores: FloatArray = self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
-        return scores
+        return self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
 
     def _derivatives(self, state: FitState) -> FloatArray:
         """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
@@ -276,7 +243,6 @@ class FitSearch:
         return np.concatenate([turns, shifts, *([places[:, :, None]] if self.constraints.free else [])], axis=2)
 
     def _landmarks(self, state: FitState, fields: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the normal matrix and the right-hand side of the landmarks."""
         constraints = self.constraints
         size = fields.shape[-1] + (7 if constraints.free else 6)
         if not len(constraints.landmarks):
@@ -301,7 +267,6 @@ class FitSearch:
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
 
     def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
-        """Take a Gauss–Newton step, or return None if there is none."""
         try:
             fields = self._derivatives(state)
         except NotPositiveDefiniteError:
@@ -377,5 +342,4 @@ class FitSearch:
 
 def _robust(distances: FloatArray, width: float) -> FloatArray:
     """Return robust weights (n,) of distances (Geman and McClure 1987)."""
-    weights: FloatArray = 1 / (1 + (distances / width) ** 2) ** 2
-    return weights
+    return 1 / (1 + (distances / width) ** 2) ** 2

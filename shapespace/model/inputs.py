@@ -1,7 +1,5 @@
 """Arguments of the library's operations: arrays, meshes and paths of files, brought to one form."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

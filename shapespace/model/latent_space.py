@@ -1,7 +1,5 @@
 """Latent codes: their coordinates, bounds and periods."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -41,15 +39,10 @@ class InvalidFixedError(LatentError):
 
 @dataclass(frozen=True, eq=False)
 class Fixed:
-    """Coordinates of a code that keep their value.
+    """Coordinates of a code that keep their value."""
 
-    Attributes:
-        mask: (m,) whether a coordinate is fixed.
-        values: (m,) values of fixed coordinates, as the networks take them; 0 for other coordinates.
-    """
-
-    mask: NDArray[np.bool_]
-    values: Codes
+    mask: NDArray[np.bool_]  # (m,) whether a coordinate is fixed
+    values: Codes  # (m,) values of fixed coordinates, as the networks take them; 0 for other coordinates
 
     def into(self, x: FloatArray) -> FloatArray:
         """Return a code (m,) with the fixed values inserted."""
@@ -217,12 +210,7 @@ class LatentSpace:
 
 
 class TrainingCodes:
-    """Training codes of a model, which measure how plausible other codes are.
-
-    Args:
-        latents: coordinates of the codes.
-        codes: (n, m) training codes, n ≥ 1.
-    """
+    """Training codes (n, m) of a model, n ≥ 1, which measure how plausible other codes are."""
 
     def __init__(self, latents: LatentSpace, codes: FloatArray) -> None:
         self._latents, self._codes = latents, codes

@@ -1,7 +1,5 @@
 """ONNX networks with a time limit for each run."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any
@@ -77,15 +75,8 @@ _watch = _Watch()
 
 
 class Session:
-    """One ONNX network, whose input and output match the manifest.
-
-    Args:
-        bundle: bundle that holds the network's bytes.
-        network: names of file, input and output.
-        inputs, outputs: expected shapes of one row.
-
-    Raises:
-        BundleError: the network doesn't load, or has other inputs or outputs.
+    """One ONNX network, whose input and output match the manifest. Rows of its input and output have the shapes
+    ``inputs`` and ``outputs``. Raises BundleError if the network doesn't load, or has other inputs or outputs.
     """
 
     def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
@@ -125,11 +116,8 @@ class Session:
             raise BundleError(f"{self._file} does not give finite numbers for zeros")
 
     def __call__(self, rows: NDArray[np.float32], until: float) -> NDArray[np.float32]:
-        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``.
-
-        Raises:
-            TerminatedError: the time was over.
-            NetworkError: the network failed, or its output has another shape.
+        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``. Raises TerminatedError if the
+        time was over, and NetworkError if the network failed or its output has another shape.
         """
         options = onnxruntime.RunOptions()
         options.log_severity_level = _FATAL

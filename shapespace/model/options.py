@@ -4,8 +4,6 @@ Each option is written here once, with its name, type, default, limits and descr
 single options by name. The HTTP interface derives its query parameters and JSON bodies from these classes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum

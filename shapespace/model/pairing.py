@@ -1,7 +1,5 @@
 """Pairs of corresponding points of a scan and a model's surface, for the steps of a fit."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -22,29 +20,17 @@ APART, ALIKE = 0.2, 0.6
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of points of the scan and of the model, in the model's frame.
+    """Pairs of points of the scan and of the model, in the model's frame."""
 
-    Attributes:
-        gaps: (n, 3) vectors from the model's points to the scan's points.
-        normals: (n, 3) normals of the model.
-        distances: (n,) distances of the points.
-        rows: (n, V) sparse matrix that computes the model's points as means of its vertices.
-        places: (n, 3) points of the model.
-        agree: (n,) agreement of the normals, from 0 to 1.
-        mass: (n,) share of the surface that each pair represents; pairs from the scan sum to 1.
-        of_scan: number of pairs that begin at points of the scan; they come first.
-        drawn: (n,) whether a pair joins unmatched parts of both sides.
-    """
-
-    gaps: FloatArray
-    normals: FloatArray
-    distances: FloatArray
-    rows: sparse.csr_array
-    places: FloatArray
-    agree: FloatArray
-    mass: FloatArray
-    of_scan: int
-    drawn: NDArray[np.bool_]
+    gaps: FloatArray  # (n, 3) vectors from the model's points to the scan's points
+    normals: FloatArray  # (n, 3) normals of the model
+    distances: FloatArray  # (n,) distances of the points
+    rows: sparse.csr_array  # (n, V) sparse matrix that computes the model's points as means of its vertices
+    places: FloatArray  # (n, 3) points of the model
+    agree: FloatArray  # (n,) agreement of the normals, from 0 to 1
+    mass: FloatArray  # (n,) share of the surface that each pair represents; pairs from the scan sum to 1
+    of_scan: int  # number of pairs that begin at points of the scan; they come first
+    drawn: NDArray[np.bool_]  # (n,) whether a pair joins unmatched parts of both sides
 
     @property
     def heights(self) -> FloatArray:
@@ -55,12 +41,9 @@ class Pairs:
 class Pairing:
     """Finds pairs of a scan and a surface.
 
-    Args:
-        scan: scan in the model's normalised units.
-        count: number of the scan's points that look for the surface.
-        vertices: vertices of the surface that look for the scan.
-        both: whether vertices look for the scan. If the scan shows only a part, the other vertices have no partner.
-        blended: whether pairs that begin at a vertex use the scan's planes where the scan has planes.
+    Some points of the scan, ``count``, look for the surface. If ``both``, the vertices given look for the scan too.
+    If the scan shows only a part, the other vertices have no partner. If ``blended``, pairs that begin at a
+    vertex use the scan's planes where the scan has planes.
     """
 
     def __init__(self, scan: Scan, count: int, vertices: IntArray, *, both: bool, blended: bool) -> None:
@@ -127,8 +110,7 @@ class Pairing:
             cosines = np.abs(cosines)
         elif cosines.sum() < 0:  # the scan's faces point inwards
             cosines = -cosines
-        agree: FloatArray = 1 - trust * (1 - np.clip((cosines - APART) / (ALIKE - APART), 0, 1))
-        return agree
+        return 1 - trust * (1 - np.clip((cosines - APART) / (ALIKE - APART), 0, 1))
 
 
 def _blended(normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:

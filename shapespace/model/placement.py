@@ -1,7 +1,5 @@
 """Start placements of a model's shapes in a scan's frame, from which a fit begins."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,23 +20,14 @@ DIFFERENT = 0.35
 
 @dataclass(frozen=True)
 class PlacementEffort:
-    """Effort of the search for placements.
+    """Effort of the search for placements."""
 
-    Attributes:
-        points: number of the scan's points by which placements are scored.
-        rotations: number of rotations beside principal axes.
-        kept: number of placements that go on to closest-point steps.
-        polished: additional number of these placements, with other shapes.
-        steps: number of closest-point steps.
-        count: maximum number of start placements.
-    """
-
-    points: int
-    rotations: int
-    kept: int
-    polished: int
-    steps: int
-    count: int
+    points: int  # number of the scan's points by which placements are scored
+    rotations: int  # number of rotations beside principal axes
+    kept: int  # number of placements that go on to closest-point steps
+    polished: int  # additional number of these placements, with other shapes
+    steps: int  # number of closest-point steps
+    count: int  # maximum number of start placements
 
 
 #: Effort for most scans, and for scans of a part: a flat shape looks alike from both sides.
@@ -48,17 +37,11 @@ THOROUGH = PlacementEffort(points=300, rotations=240, kept=48, polished=48, step
 
 @dataclass(frozen=True, eq=False)
 class StartPlacement:
-    """Placement at which a fit may begin.
+    """Placement at which a fit may begin."""
 
-    Attributes:
-        shape: index of the shape.
-        placement: placement of the shape in the scan's frame.
-        score: mean of the distances that count, in the model's units.
-    """
-
-    shape: int
-    placement: Placement
-    score: float
+    shape: int  # index of the shape
+    placement: Placement  # placement of the shape in the scan's frame
+    score: float  # mean of the distances that count, in the model's units
 
 
 def start_placements(
@@ -66,12 +49,8 @@ def start_placements(
 ) -> list[StartPlacement]:
     """Find the best placements of shapes in a scan, each clearly different from the better ones.
 
-    Args:
-        scan: scan in the model's units.
-        shapes: (k, n, 3) evenly spread points of k shapes.
-        partial: whether the scan shows only a part of the shape. Points of the shape may then be far from the scan.
-        free: whether the size may change too.
-        effort: effort of the search.
+    The k shapes are evenly spread points (k, n, 3) in the units of the scan. If ``partial``, points of a shape may be
+    far from the scan. If ``free``, the size may change too.
     """
     some = scan.some(effort.points).points
     turns = np.concatenate([_grid(effort.rotations), *(_principal(shape, some) for shape in shapes[:1])])
@@ -127,7 +106,6 @@ def _scored(
 def _polished(
     start: StartPlacement, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
 ) -> StartPlacement:
-    """Improve a placement by closest-point steps of the rigid motion."""
     placement, own = start.placement, cKDTree(shape)
     for _ in range(steps):
         to_shape, nearest = nearest_points(own, placement.back(some))
@@ -158,8 +136,7 @@ def _grid(count: int) -> FloatArray:
     r, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     phi, psi = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
     quaternions = np.stack([r * np.sin(phi), r * np.cos(phi), outer * np.sin(psi), outer * np.cos(psi)], axis=1)
-    rotations: FloatArray = Rotation.from_quat(quaternions).as_matrix()
-    return rotations
+    return Rotation.from_quat(quaternions).as_matrix()
 
 
 def _principal(shape: FloatArray, some: FloatArray) -> FloatArray:

@@ -21,27 +21,18 @@ SMALLEST = 2
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Gaussian around a code (Laplace's approximation).
+    """Gaussian around a code (Laplace's approximation)."""
 
-    Attributes:
-        covariance: (m, m) covariance, zero in the rows and columns of fixed coordinates.
-        root: (m, f) with f free coordinates, ``root rootᵀ = covariance``.
-    """
-
-    covariance: FloatArray
-    root: FloatArray
+    covariance: FloatArray  # (m, m) covariance, zero in the rows and columns of fixed coordinates
+    root: FloatArray  # (m, f) with f free coordinates, ``root rootᵀ = covariance``
 
     @classmethod
     def of(cls, normal: FloatArray, population: Population, fixed: NDArray[np.bool_]) -> Posterior:
         """Compute the posterior from the Hessian of the data's misfit at the optimum.
 
-        The covariance is ``(Σ⁻¹ + JᵀJ)⁻¹`` over the free coordinates, with Σ the covariance of the population. J is
-        the derivative of the residuals divided by their standard deviations.
-
-        Args:
-            normal: (m, m) JᵀJ, or another Hessian of half the squared misfit.
-            population: prior distribution of codes.
-            fixed: (m,) whether a coordinate is fixed.
+        The covariance is ``(Σ⁻¹ + JᵀJ)⁻¹`` over the free coordinates, with Σ the covariance of the population. J is the
+        derivative of the residuals divided by their standard deviations. ``normal`` (m, m) is JᵀJ, or another Hessian
+        of half the squared misfit.
         """
         free = np.flatnonzero(~fixed)
         whitening = solve_triangular(population.root, np.eye(len(fixed)), lower=True)[:, free]
@@ -62,11 +53,7 @@ def independent_share(residuals: FloatArray, patches: Iterable[IntArray]) -> flo
 
     Residuals of neighbours are correlated. The sum over a patch of b vertices has b · τ times the variance of one
     vertex, and τ = 1 without correlation. The share is 1/τ for the patch size with the largest τ (integrated
-    autocorrelation by batch means; Geyer 1992).
-
-    Args:
-        residuals: (V, 3) residuals of a fit.
-        patches: patches of the vertices, see ``patches_of``.
+    autocorrelation by batch means; Geyer 1992). For patches see ``patches_of``.
     """
     count, square = len(residuals), float((residuals**2).mean())
     if square == 0:

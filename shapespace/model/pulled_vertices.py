@@ -1,7 +1,5 @@
 """Positions of edited vertices as functions of the code, with derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 
@@ -17,13 +15,8 @@ from shapespace.solve.deadline import Deadline
 class PulledVertices:
     """Normalised positions of k vertices with targets and of all V coarse vertices, as functions of the code.
 
-    Args:
-        decoder: decoder of the codes.
-        reconstruct: solver that the decoder has lent.
-        vertices: (k,) vertices with targets.
-        mesh: mesh that ``vertices`` belong to.
-        deadline: time limit of the reconstructions.
-        rough: whether shapes come from face frames and derivatives from the single factors, see SearchedShapes.
+    The k vertices belong to ``mesh``. If ``rough``, shapes come from face frames and derivatives from the single
+    factors, see SearchedShapes.
     """
 
     def __init__(

@@ -29,23 +29,14 @@ class InvalidScanError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Points and normals that represent a scan.
+    """Points and normals that represent a scan."""
 
-    Attributes:
-        points: (n, 3) evenly spread points in the scan's units, at most MOST.
-        normals: (n, 3) unit normals.
-        trust: (n,) weight of each normal, from 0 to 1; 0 where the neighbours form no plane.
-        oriented: whether normals point outwards; normals of local planes may point either way.
-        given: number of points or vertices of the original scan.
-        sampled: whether ``points`` differ from the original points.
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    trust: FloatArray
-    oriented: bool
-    given: int
-    sampled: bool
+    points: FloatArray  # (n, 3) evenly spread points in the scan's units, at most MOST
+    normals: FloatArray  # (n, 3) unit normals
+    trust: FloatArray  # (n,) weight of each normal, from 0 to 1; 0 where the neighbours form no plane
+    oriented: bool  # whether normals point outwards; normals of local planes may point either way
+    given: int  # number of points or vertices of the original scan
+    sampled: bool  # whether ``points`` differ from the original points
 
     @property
     def size(self) -> float:
@@ -106,16 +97,9 @@ def independent_points(points: FloatArray, residuals: FloatArray, weights: Float
 
 
 def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Scan:
-    """Check a scan and sample it.
-
-    Args:
-        points: (N, 3) points.
-        faces: (F, 3) faces; F may be 0. Faces without area are left out.
-        rng: random numbers for the samples.
-
-    Raises:
-        InvalidScanError: fewer than ten points, a point that is not finite, all points in a plane or at one place, or
-            faces with indices out of range.
+    """Check a scan and sample it. Points are (N, 3), faces (F, 3), and F may be 0. Faces without area are left out.
+    Raises InvalidScanError if there are fewer than ten points, a point is not finite, all points lie in a plane or at
+    one place, or indices of faces are out of range.
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise InvalidScanError(f"A scan must be points (N, 3), not {points.shape}. Send x, y and z of each.")

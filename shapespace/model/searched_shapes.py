@@ -1,7 +1,5 @@
 """Shapes of successive codes in a search, with derivatives by the code."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray
@@ -15,15 +13,9 @@ class SearchedShapes:
 
     Each shape is reconstructed from the last shape, or from integrated frames if the frames are nearer.
 
-    Args:
-        model: decoder of the codes.
-        reconstruct: solver that the decoder has lent.
-        deadline: time limit; later shapes are not iterated further.
-        rough: use the shape of the frames (shapespace.coordinates.frame_integration) without Gauss–Newton. It takes at
-            most a third of the time and differs by about half a percent of the diagonal.
-
-    Attributes:
-        count: number of reconstructed shapes.
+    The decoder has lent the solver. After the deadline, shapes are not iterated further. If ``rough``, shapes are the
+    shapes of the frames (shapespace.coordinates.frame_integration), without Gauss–Newton. This takes at most a third of
+    the time and differs by about half a percent of the diagonal.
     """
 
     def __init__(

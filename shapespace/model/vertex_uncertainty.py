@@ -1,7 +1,5 @@
 """Standard deviation of a shape's vertices, from the covariance of its code."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -46,17 +44,11 @@ def vertex_uncertainty(
     deadline: Deadline | None = None,
 ) -> FloatArray:
     """Return the standard deviation (V,) of vertices, ``√tr(J C Jᵀ)`` with J the derivative of a vertex by the code.
+    For C see ``require_covariance``. The vertices, on ``mesh``, are aligned to the reference. After the deadline the
+    shape is not iterated further.
 
-    Args:
-        model: decoder of the code.
-        code: (m,) code.
-        covariance: (m, m) covariance C, see ``require_covariance``.
-        mesh: mesh of the vertices, which are aligned to the reference.
-        deadline: time limit; the shape is not iterated further after it.
-
-    Raises:
-        NotFiniteError: the numbers overflow at this code.
-        InvalidCovarianceError: the shape has nearly collapsed, so it has no derivative.
+    Raises NotFiniteError if the numbers overflow at this code, and InvalidCovarianceError if the shape has nearly
+    collapsed, so that it has no derivative.
     """
     scale, x = model.manifest.scale, code.astype(np.float64)
     values, vectors = np.linalg.eigh(covariance)
@@ -70,5 +62,4 @@ def vertex_uncertainty(
                 "The shape of this code has all but collapsed: how it changes is unknown. Leave color=spread out."
             ) from None
     moves = carried(model, lambda shapes: model.placed(shapes, mesh), coarse, fields)
-    result: FloatArray = scale * np.sqrt((moves**2).sum(axis=(0, 2)))
-    return result
+    return scale * np.sqrt((moves**2).sum(axis=(0, 2)))

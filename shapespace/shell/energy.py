@@ -108,11 +108,8 @@ def _opposite(q: FloatArray) -> FloatArray:
 class RestShape:
     """Rest shapes z (…, 2E), prepared for the energy of many deformed shapes.
 
-    Leading dimensions broadcast: K rest shapes with K deformed shapes, or one rest shape with many.
-
-    Attributes:
-        z: (…, 2E).
-        areas: (…, F) areas of the faces.
+    Leading dimensions broadcast: K rest shapes with K deformed shapes, or one rest shape with many. Areas of the faces
+    are (…, F).
     """
 
     def __init__(self, energy: ShellEnergy, z: FloatArray) -> None:

@@ -34,15 +34,10 @@ class Renewals:
     slow: float = 0.5  # an iteration with a factor fails if two iterations leave more than this share of the residual
 
 
-@dataclass(frozen=True)
-class ExactNewton:
-    """Limits of exact Newton."""
-
-    iterations: int = 12  # 4 to 8 suffice where it converges; beyond, a face collapses (posed bodies)
-    smallest_step: float = 1 / 16  # smallest step length of the line search
-
-
-RENEWALS, NEWTON = Renewals(), ExactNewton()
+RENEWALS = Renewals()
+#: Most steps of exact Newton: 4 to 8 suffice where it converges, beyond, a face collapses (posed bodies). Smallest step
+#: length of its line search.
+NEWTON_STEPS, SMALLEST_STEP = 12, 1 / 16
 
 
 def exponential(
@@ -99,15 +94,9 @@ def extrapolate(
 ) -> DiscretePath:
     """Continue a discrete geodesic from two neighbouring shapes.
 
-    Args:
-        space: Riemannian space of the shapes.
-        first: (V, 3).
-        second: (V, 3), one time step later, or earlier if not ``forward``.
-        steps: number of shapes to add.
-        forward: whether time runs forward. W is not symmetric, so a backward step solves another equation: a forward
-            step from its solution and ``second`` leads to ``first`` exactly.
-        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)`` at every step.
-        deadline: checked before every step; after it the status is Status.DEADLINE.
+    The second shape (V, 3) is one time step later than the first, or earlier if not ``forward``. W is not symmetric, so
+    a backward step solves another equation: a forward step from its solution and ``second`` leads to ``first`` exactly.
+    For tolerance and deadline see ``exponential``.
 
     Returns:
         2 + steps shapes, the given ones first, or fewer if a step failed.
@@ -252,13 +241,9 @@ def _chord(
 ) -> _Solution:
     """Iterate ``X ← X + A⁻¹F(X)`` with a fixed factor, accelerated, until it converges or slows down.
 
-    Args:
-        equation: the step to solve.
-        chord: A⁻¹ at a nearby shape.
-        start: first guess.
-        tolerance: tolerance of ``sqrt(Fᵀ A⁻¹ F)``. Once it is met, one more step is taken. This costs little, and
-            errors grow a hundredfold when shapes are extrapolated.
-        limit: the iteration ends once its rate predicts more iterations than this.
+    Once the tolerance of ``sqrt(Fᵀ A⁻¹ F)`` is met, one more step is taken. This costs little, and errors grow a
+    hundredfold when shapes are extrapolated. The iteration also ends once its rate predicts more than ``limit``
+    iterations.
     """
     space, mixing = equation.current.space, Anderson()
     x, residuals = start, [np.inf, np.inf]
@@ -280,10 +265,10 @@ def _chord(
 def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
     """Solve by exact Newton with a line search, from the present shape. A factor measures the residuals."""
     point, forces, residual = equation.current, *_measured(equation, chord, equation.current)
-    for iteration in range(NEWTON.iterations + 1):
+    for iteration in range(NEWTON_STEPS + 1):
         if residual <= tolerance:
             return _accepted(equation, point, iteration, residual)
-        if iteration == NEWTON.iterations:
+        if iteration == NEWTON_STEPS:
             break
         try:
             step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
@@ -293,11 +278,10 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
         if found is None:
             return _stalled(point, iteration, residual, f"Newton stalls at residual {residual:.1e}")
         point, forces, residual = found
-    return _stalled(point, NEWTON.iterations, residual, f"Newton is slow, residual {residual:.1e}")
+    return _stalled(point, NEWTON_STEPS, residual, f"Newton is slow, residual {residual:.1e}")
 
 
 def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
-    """Compute F at a shape, and the residual."""
     forces = equation.forces(point)
     return forces, step_length(forces, chord.solve(forces))
 
@@ -311,5 +295,5 @@ def _line_search(
         there = point.space.point(point.vertices + t * step)
         return there, *_measured(equation, chord, there)
 
-    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, NEWTON.smallest_step)
+    found = backtrack(trial, lambda t, there: there[2] < (1 - t / 4) * residual, SMALLEST_STEP)
     return found and found[1]

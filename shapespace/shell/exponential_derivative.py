@@ -1,7 +1,5 @@
 """The derivative of the time-discrete exponential map by the velocity, and its transpose."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
@@ -92,7 +90,6 @@ class ExponentialDerivative:
 
 
 def _apply(matrix: sparse.csc_array | sparse.csr_array, fields: FloatArray) -> FloatArray:
-    """Multiply a matrix with fields (n, V, 3)."""
     product: FloatArray = np.asarray(matrix @ fields.reshape(len(fields), -1).T)
     return product.T.reshape(fields.shape)
 

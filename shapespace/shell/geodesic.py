@@ -1,7 +1,5 @@
 """The time-discrete geodesic between two shapes, and the logarithm (paper, appendix B)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise

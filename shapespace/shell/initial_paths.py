@@ -1,9 +1,6 @@
 """The energy of a path, and initial paths for the geodesic equation: straight, bisected, or of least energy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,26 +13,11 @@ from shapespace.solve.truncated_newton import descend
 
 #: Largest number of Newton steps when the path energy is minimised.
 MOST_DESCENTS = 30
-
-
-@dataclass(frozen=True)
-class MiddleSearch:
-    """Limits of the search for a middle shape, which need not be exact."""
-
-    iterations: int = 30  # most steps
-    tolerance: float = 1e-2  # of the residual
-
-
-@dataclass(frozen=True)
-class NearestSearch:
-    """Limits of the Gauss–Newton steps to each shape of a straight path, which need not be exact."""
-
-    iterations: int = 4  # most steps
-    smallest_step: float = 1 / 32  # smallest step length
-    gain: float = 0.1  # the steps end once one of them reduces the squared misfit by less than this share
-
-
-MIDDLE, NEAREST = MiddleSearch(), NearestSearch()
+#: Most steps to a middle shape, and tolerance of its residual: it need not be exact.
+MIDDLE_STEPS, MIDDLE_TOLERANCE = 30, 1e-2
+#: Most Gauss–Newton steps to a shape of a straight path, which need not be exact, and the smallest step length. The
+#: steps end once one of them reduces the squared misfit by less than the share `SMALLEST_GAIN`.
+NEAREST_STEPS, SMALLEST_STEP, SMALLEST_GAIN = 4, 1 / 32, 0.1
 
 
 def inverse_in_time(steps: int) -> FloatArray:
@@ -124,14 +106,14 @@ def nearest(chord: ChordSolver, target: FloatArray) -> FloatArray:
     Distances are measured in the metric at the shape of the factor.
     """
     point, misfit, square = _compared(chord.at, chord.at, target)
-    for _ in range(NEAREST.iterations):
+    for _ in range(NEAREST_STEPS):
         step = chord.solve(point.pull_back(chord.at.lower(misfit)))
         found = _line_search(chord.at, target, point, step, square)
         if found is None:
             break
         before = square
         point, misfit, square = found
-        if 1 - square / before < NEAREST.gain:
+        if 1 - square / before < SMALLEST_GAIN:
             break
     return point.vertices
 
@@ -148,11 +130,10 @@ def _compared(metric: ShellPoint, point: ShellPoint, target: FloatArray) -> _Com
 def _line_search(
     metric: ShellPoint, target: FloatArray, point: ShellPoint, step: FloatArray, square: float
 ) -> _Compared | None:
-    """Find a shape along a step that is closer to the target and has no collapsed face."""
     found = backtrack(
         lambda t: _compared(metric, point.space.point(point.vertices + t * step), target),
         lambda _, there: there[2] < square and keeps_faces(point.space, point.vertices, there[0].vertices),
-        NEAREST.smallest_step,
+        SMALLEST_STEP,
     )
     return found and found[1]
 
@@ -171,7 +152,7 @@ def bisected(space: ShellSpace, start: FloatArray, end: FloatArray, factorise: l
         k = (i + j) // 2
         between = _Middle(space, shapes[i], shapes[j], (k - i, j - k), factorise[0])
         nearer = shapes[i] if k - i <= j - k else shapes[j]
-        shapes[k] = descend(between, nearer, MIDDLE.tolerance, MIDDLE.iterations).x
+        shapes[k] = descend(between, nearer, MIDDLE_TOLERANCE, MIDDLE_STEPS).x
         fill(i, k)
         fill(k, j)
 

@@ -1,7 +1,5 @@
 """Weighted means of shapes: the elastic mean and the Riemannian centre of mass."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -141,8 +139,6 @@ def _quasi_newton(mean: _MeanEnergy, start: FloatArray) -> Mean:
 def _line_search(
     mean: _MeanEnergy, point: ShellPoint, energy: float, step: FloatArray, slope: float
 ) -> tuple[ShellPoint, float] | None:
-    """Find a shape along a step that lowers the energy enough, and its energy."""
-
     def trial(t: float) -> tuple[ShellPoint, float]:
         there = mean.space.point(point.vertices + t * step)
         return there, mean.value_at(there)

@@ -1,7 +1,5 @@
 """Parallel transport along a path of shapes, by Schild's ladder (Rumpf and Wirth 2015)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

@@ -1,12 +1,10 @@
 """Rotations of vertices from one shape to another, smooth over the mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.mesh.triangle_mesh import Connectivity, faces_at_vertices
 from shapespace.mesh.vectors import components, cross, dot
 
 
@@ -28,9 +26,7 @@ class VertexRotations:
 
     def __init__(self, connectivity: Connectivity) -> None:
         self._corners = connectivity.face_corners
-        faces = len(connectivity.faces)
-        corner = (self._corners.ravel(), np.tile(np.arange(faces), 3))
-        self._around = sparse.csr_array((np.ones(3 * faces), corner), shape=(connectivity.vertex_count, faces))
+        self._around = faces_at_vertices(connectivity.faces, connectivity.vertex_count)
         self._neighbours = sparse.csr_array((self._around @ self._around.T).astype(bool).astype(np.float64))
 
     def face_frames(self, vertices: FloatArray) -> FloatArray:

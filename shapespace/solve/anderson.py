@@ -1,7 +1,5 @@
 """Anderson acceleration of a preconditioned fixed-point iteration (Walker and Ni 2011)."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg.lapack import dgelss
 

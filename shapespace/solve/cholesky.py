@@ -39,15 +39,8 @@ class NotPositiveDefiniteError(ArithmeticError):
 class SymmetricPattern:
     """The pattern of the upper triangle of a symmetric sparse matrix, into which contributions are summed.
 
-    Args:
-        size: N.
-        rows: (C,) row of each contribution; an entry may receive several.
-        columns: (C,) column of each contribution. A contribution below the diagonal is added to the mirrored entry.
-
-    Attributes:
-        slots: (C,) index of the entry of each contribution.
-        indptr, indices: CSR structure of the upper triangle, with all diagonal entries.
-        diagonal: (N,) index of each diagonal element among the entries.
+    C contributions have ``rows`` and ``columns`` (C,); an entry may receive several. A contribution below the diagonal
+    is added to the mirrored entry.
     """
 
     def __init__(self, size: int, rows: IntArray, columns: IntArray) -> None:
@@ -56,8 +49,9 @@ class SymmetricPattern:
         key = np.concatenate([low * size + high, diagonal * (size + 1)])
         entries, slots = np.unique(key, return_inverse=True)
         self.size = size
-        self.slots: IntArray = slots[: len(rows)]
-        self.diagonal: IntArray = slots[len(rows) :]
+        self.slots: IntArray = slots[: len(rows)]  # (C,) index of the entry of each contribution
+        self.diagonal: IntArray = slots[len(rows) :]  # (N,) index of each diagonal element among the entries
+        # CSR structure of the upper triangle, with all diagonal entries.
         self.indices = (entries % size).astype(np.int32)
         self.indptr = np.searchsorted(entries, np.arange(size + 1) * size).astype(np.int32)
 
@@ -260,12 +254,9 @@ def analyse(
 ) -> Cholesky:
     """Analyse a pattern for later factorisations.
 
-    Args:
-        pattern: pattern of the matrices.
-        backend: library; ``auto`` takes Pardiso if it is installed.
-        factors: number of factors that can be held at the same time.
-        precision: precision of the factors. Single precision takes two thirds of the time, and suffices in iterations
-            that correct errors. It fails on some matrices that have a factor in double precision.
+    The backend ``auto`` takes Pardiso if it is installed. Up to ``factors`` factors can be held at the same time.
+    Single precision takes two thirds of the time, and suffices in iterations that correct errors. It fails on some
+    matrices that have a factor in double precision.
     """
     if backend == "auto":
         backend = "pardiso" if importlib.util.find_spec("pypardiso") else "banded"

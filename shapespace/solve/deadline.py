@@ -9,14 +9,10 @@ COMPLETING_SHARE, COMPLETING_SECONDS = 0.25, 2.0
 
 
 class Deadline:
-    """The time by which work has to end, in seconds from now. It can be called off earlier, from any thread.
-
-    Attributes:
-        time: end time on the clock of ``time.monotonic``.
-    """
+    """The time by which work has to end, in seconds from now. It can be called off earlier, from any thread."""
 
     def __init__(self, seconds: float) -> None:
-        self.time = time.monotonic() + seconds
+        self.time = time.monotonic() + seconds  # on the clock of ``time.monotonic``
         self._called_off = False
 
     @property

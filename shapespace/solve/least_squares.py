@@ -1,7 +1,5 @@
 """Nonlinear least squares in a box, for few unknowns and expensive residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,15 +8,11 @@ from scipy.linalg import cholesky, solve_triangular
 
 from shapespace.arrays import FloatArray
 from shapespace.solve.deadline import Deadline
-from shapespace.solve.outcome import Outcome, Status
+from shapespace.solve.outcome import Outcome, Status, limit_reached
 
-
-@dataclass(frozen=True)
-class SecantLimits:
-    """When an updated Jacobian is replaced by a new one."""
-
-    distance: float = 0.05  # at a minimum, largest distance to where it was computed, in units of the scale
-    gain: float = 0.25  # smallest ratio of a step's actual to its predicted gain at which it is kept
+#: An updated Jacobian is replaced at a minimum farther than `SECANT_DISTANCE` from where it was computed, in units of
+#: the scale, and after a step with a smaller ratio of actual to predicted gain than `SECANT_GAIN`.
+SECANT_DISTANCE, SECANT_GAIN = 0.05, 0.25
 
 
 @dataclass(frozen=True)
@@ -33,7 +27,7 @@ class StepControl:
     factor: float = 10  # increase and decrease of the damping
 
 
-SECANT, CONTROL = SecantLimits(), StepControl()
+CONTROL = StepControl()
 
 
 @dataclass(frozen=True)
@@ -47,22 +41,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Stopping:
-    """When the iteration ends.
+    """When the iteration ends."""
 
-    Attributes:
-        tolerance: the iteration has converged once no unknown would move further than this fraction of its scale.
-        gain_tolerance: it has also converged once ``‖r‖²`` would decrease by at most this fraction of itself.
-        large: if ``‖r‖`` is larger than this, the fraction refers to ``large · ‖r‖``: most of such a residual can't
-            vanish.
-        max_evaluations: largest number of evaluations of the residuals.
-        deadline: no evaluation begins after it.
-    """
-
+    # the iteration has converged once no unknown would move further than this fraction of its scale
     tolerance: float = 1e-4
+    # it has also converged once ``‖r‖²`` would decrease by at most this fraction of itself
     gain_tolerance: float = 1e-6
+    # if ``‖r‖`` is larger than this, the fraction refers to ``large · ‖r‖``: most of such a residual can't vanish
     large: float = np.inf
-    max_evaluations: int = 40
-    deadline: Deadline | None = None
+    max_evaluations: int = 40  # largest number of evaluations of the residuals
+    deadline: Deadline | None = None  # no evaluation begins after it
 
     def nothing_to_gain(self, step: FloatArray, predicted: float, cost: float) -> bool:
         """Whether a step, in units of the scale, is too small or gains too little for another evaluation."""
@@ -70,24 +58,13 @@ class Stopping:
             np.abs(step).max() <= self.tolerance or predicted <= self.gain_tolerance * shrinkable(cost, self.large)
         )
 
-    def reached(self, evaluations: int) -> Status | None:
-        """Return the limit that is reached after a number of evaluations, or None."""
-        if evaluations >= self.max_evaluations:
-            return Status.ITERATION_LIMIT
-        return Status.DEADLINE if self.deadline is not None and self.deadline.passed else None
-
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(Outcome):
-    """The result of the iteration. Its iterations count evaluations of the residuals, without Jacobians.
+    """The result of the iteration. Its iterations count evaluations of the residuals, without Jacobians."""
 
-    Attributes:
-        x: (m,) unknowns in the box.
-        residuals: (n,) r(x), whose norm is the residual.
-    """
-
-    x: FloatArray
-    residuals: FloatArray
+    x: FloatArray  # (m,) unknowns in the box
+    residuals: FloatArray  # (n,) r(x), whose norm is the residual
 
     @property
     def cost(self) -> float:
@@ -112,13 +89,8 @@ def least_squares(
     steps. If the point has moved far since, a new one is also computed at the end: where residuals don't vanish, the
     minimum is only as accurate as the Jacobian. ``scipy.optimize.least_squares`` would compute a Jacobian in each step.
 
-    Args:
-        residuals: function r from (m,) to (n,).
-        jacobian: function from x and r(x) to (n, m).
-        start: (m,); unknowns outside the box are clipped to it.
-        box: bounds and scales of the unknowns.
-        stopping: when to end.
-        secant: whether to use secant updates; otherwise a Jacobian is computed in each step.
+    The residuals map (m,) to (n,), and ``jacobian`` maps x and r(x) to (n, m). Unknowns of the start outside the box
+    are clipped to it. Without ``secant``, a Jacobian is computed in each step.
     """
     stopping = stopping or Stopping()
     scale, low, high = box.scale, box.lower / box.scale, box.upper / box.scale
@@ -133,7 +105,7 @@ def least_squares(
     if not np.isfinite(r).all():
         return fit(Status.NOT_FINITE, "the residuals at the start are not finite")
     J = _Jacobian(lambda u, r: jacobian(u * scale, r) * scale, secant, u, r)
-    while (reached := stopping.reached(evaluations)) is None:
+    while (reached := limit_reached(evaluations, stopping.max_evaluations, stopping.deadline)) is None:
         if not np.isfinite(J.matrix).all():
             return fit(Status.STALLED, "the Jacobian is not finite")
         step = _step(J.matrix, r, low - u, high - u, damping)
@@ -179,7 +151,7 @@ class _Jacobian:
 
     def is_outdated(self, u: FloatArray) -> bool:
         """Whether the Jacobian has been updated and was computed too far from this point to identify a minimum."""
-        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > SECANT.distance)
+        return self.updates > 0 and bool(np.abs(u - self._made_at).max() > SECANT_DISTANCE)
 
     def follow(self, step: FloatArray, change: FloatArray) -> None:
         """Update the Jacobian so that it predicts the change of the residuals along a step that was taken.
@@ -191,7 +163,7 @@ class _Jacobian:
 
     def renew_or_keep(self, u: FloatArray, r: FloatArray, taken: bool, gain: float) -> None:
         """Compute a new Jacobian if necessary, after a step with this ratio of actual to predicted gain."""
-        disappointing = self.updates > 0 and not gain > SECANT.gain
+        disappointing = self.updates > 0 and not gain > SECANT_GAIN
         if (taken and not self._secant) or disappointing or self.updates == len(u):
             self.renew(u, r)
         else:

@@ -1,7 +1,5 @@
 """Backtracking line search."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -16,13 +14,8 @@ def backtrack(
 ) -> tuple[float, Trial] | None:
     """Find the first of t = 1, 1/2, 1/4, … whose trial is accepted (Nocedal and Wright 2006, algorithm 3.1).
 
-    Args:
-        trial: computes the candidate at step length t.
-        accepts: acceptance rule for t and its trial.
-        smallest: smallest t that is tried; may be 0 only if the rule accepts every sufficiently short step.
-
-    Returns:
-        t and its trial, or None if no trial is accepted.
+    Returns t and its trial, or None if no trial is accepted. The smallest t may be 0 only if the rule accepts every
+    sufficiently short step.
     """
     t = 1.0
     while t >= smallest:
@@ -36,11 +29,7 @@ def backtrack(
 def sufficient_decrease(before: float, after: float, t: float, slope: float, rounding: float = 0.0) -> bool:
     """Check Armijo's rule for a value that decreases by ``t · slope`` to first order; False for NaN.
 
-    Args:
-        before: value at t = 0.
-        after: value at t.
-        t: step length.
-        slope: negative derivative along the step, positive for a descent direction.
-        rounding: numerical error of the values that the rule tolerates.
+    The slope is the negative derivative along the step, positive for a descent direction. The rule tolerates a
+    numerical error ``rounding`` of the values.
     """
     return after <= before - ARMIJO * t * slope + rounding

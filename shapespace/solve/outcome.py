@@ -1,11 +1,11 @@
 """The outcome of an iteration: how it ended is a value, not an exception."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+
+from shapespace.solve.deadline import Deadline
 
 
 class Status(StrEnum):
@@ -43,3 +43,10 @@ class Outcome:
     def converged(self) -> bool:
         """Whether the tolerance is met."""
         return self.status is Status.CONVERGED
+
+
+def limit_reached(iterations: int, most: int, deadline: Deadline | None) -> Status | None:
+    """Return the limit that an iteration has reached, if any."""
+    if iterations >= most:
+        return Status.ITERATION_LIMIT
+    return Status.DEADLINE if deadline is not None and deadline.passed else None

@@ -1,7 +1,5 @@
 """Chord steps: Newton steps with the matrix of an earlier point, factorised once (Kelley 1995, section 5.4)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

@@ -1,7 +1,5 @@
 """Minimisation of an energy with a barrier: Newton steps by conjugate gradients, each with a line search."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -61,13 +59,8 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
     """Minimise by truncated Newton (Nocedal and Wright 2006, algorithm 7.1): short steps always lower the energy.
 
     Products with the Hessian are differences of forces. A step ends at the first direction of negative curvature.
-    Exceptions of ``energy.precondition`` are passed on, such as NotPositiveDefiniteError.
-
-    Args:
-        energy: see Energy.
-        x: start, with finite energy.
-        tolerance: tolerance of the residual.
-        max_iterations: largest number of steps.
+    Exceptions of ``energy.precondition`` are passed on, such as NotPositiveDefiniteError. The energy of the start is
+    finite.
     """
     value, residual, status = energy.value(x), np.inf, Status.ITERATION_LIMIT
     for iteration in range(max_iterations + 1):
@@ -95,7 +88,6 @@ def descend(energy: Energy, x: FloatArray, tolerance: float, max_iterations: int
 def _line_search(
     energy: Energy, x: FloatArray, value: float, step: FloatArray, slope: float
 ) -> tuple[float, float] | None:
-    """Find a share of a step that is admitted and lowers the energy enough, and the energy there."""
     rounding = LIMITS.rounding * abs(value)
     return backtrack(
         lambda t: energy.value(x + t * step) if energy.admits(x, t * step) else np.nan,

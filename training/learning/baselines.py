@@ -1,7 +1,5 @@
 """Baselines without networks: kernel ridge regression on codes, and multilinear interpolation of each factor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -48,12 +46,8 @@ class LatentKernel(nn.Module):
     The inputs x are bounded coordinates in [−1, 1], and the cosine and sine of periodic coordinates. Held-out codes
     choose the length ℓ and the penalty.
 
-    Args:
-        coordinates: bounds and periods of the codes.
-        scaling: scaling of the NRIC.
-        own: training codes (n, m) and their NRIC (n, 2E).
-        held_out: codes and NRIC that choose length and penalty.
-        slopes: codes (k, m) and derivatives (k, m, 2E) there, fitted as well; only for coordinates without a period.
+    Pairs ``own`` and ``held_out`` are codes (n, m) and their NRIC (n, 2E). ``slopes`` are codes (k, m) and derivatives
+    (k, m, 2E) there, fitted as well; only for coordinates without a period.
     """
 
     anchors: Tensor
@@ -110,11 +104,8 @@ class LatentKernel(nn.Module):
 class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
 
-    Args:
-        coordinates: bounds and periods of all latents.
-        factor: indices of the factor's latents.
-        nodes: number of nodes along each latent. The end of a period equals its beginning and does not count.
-        shapes: exact NRIC (n, 2E) of codes (n, m).
+    There are ``nodes`` along each latent of the factor. The end of a period equals its beginning and does not count.
+    ``shapes`` computes exact NRIC (n, 2E) of codes (n, m).
     """
 
     def __init__(
@@ -134,8 +125,7 @@ class MultilinearGrid:
 
     def __call__(self, latents: FloatArray) -> FloatArray:
         """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
-        result: FloatArray = self.interpolate(latents[:, self.factor])
-        return result
+        return self.interpolate(latents[:, self.factor])
 
 
 def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:

@@ -1,7 +1,5 @@
 """The composite network ``Φ = Ψ ∘ (ψ_1, …, ψ_J)`` (paper, section 3), and the affine sum that it corrects."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -27,8 +25,7 @@ class Composite:
 
     def __call__(self, latents: Tensor) -> Tensor:
         """Return NRIC (n, 2E) of codes (n, m)."""
-        result: Tensor = self.combiner(self.factor_shapes(latents))
-        return result
+        return self.combiner(self.factor_shapes(latents))
 
     def factor_shapes(self, latents: Tensor) -> Tensor:
         """Return the outputs (n, J, 2E) of the factor networks for codes (n, m)."""

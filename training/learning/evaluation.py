@@ -1,4 +1,4 @@
-"""Figures of the paper's table for one run: R² of every model, vertex error, sizes and times."""
+"""Figures of a run for the paper's table: R² of every model, vertex error, sizes and times; shapes for the report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.baselines import ExactShapes, factor_grids
 from shapespace.training.learning.composite import Composite, affine_sum
-from shapespace.training.learning.gallery import extremes, strip
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
@@ -46,6 +45,8 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
     return {"total": ratio(slice(None)), "lengths": ratio(slice(0, half)), "angles": ratio(slice(half, None))}
 
 
+#: Number of frames of an interpolation for the report.
+STRIP_FRAMES = 7
 #: Map from codes (n, m) to NRIC of joint shapes (n, 2E), or of factor shapes (n, J, 2E).
 Model = Callable[[torch.Tensor], torch.Tensor]
 
@@ -55,9 +56,8 @@ def reconstruct(
 ) -> tuple[FloatArray, FloatArray, dict[str, Any]]:
     """Reconstruct predicted NRIC (n, 2E), and compare with exact vertices (n, V, 3) after rigid alignment.
 
-    Returns:
-        The aligned vertices (n, V, 3); vertex distances (n, V), as fractions of the reference's bounding-box diagonal;
-        ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
+    Returns the aligned vertices (n, V, 3); vertex distances (n, V), as fractions of the reference's bounding-box
+    diagonal; ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
     """
     reconstructor = Reconstructor(reference, eta)
     shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
@@ -100,15 +100,12 @@ class HeldOutSamples:
 
     def predicted(self, model: Model) -> NDArray[np.float32]:
         """Return a model's prediction for all codes."""
-        result: NDArray[np.float32] = predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
-        return result
+        return predict(model, torch.as_tensor(self.latents, dtype=torch.float32)).numpy()
 
 
 def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Compare every model with the exact shapes of the test codes.
-
-    Returns:
-        The contents of evaluation.json and of gallery.npz.
+    """Compare every model with the exact shapes of the test codes. Returns the contents of evaluation.json and of
+    gallery.npz.
     """
     config, collection = learner.config, learner.collection
     settings, reference = config.evaluation, collection.reference
@@ -205,9 +202,8 @@ def on_fresh_codes(
 def exact_factors(learner: Learner, rows: IntArray, exact: ExactShapes) -> tuple[NDArray[np.float32], IntArray]:
     """Return exact shapes of each factor's part of joint samples (n,).
 
-    Returns:
-        NRIC (k, J, 2E) of the samples for which all factors have a shape, and the indices (k,) of these samples. A
-        joint shape can exist where the shape of one factor does not.
+    Returns NRIC (k, J, 2E) of the samples for which all factors have a shape, and the indices (k,) of these samples. A
+    joint shape can exist where the shape of one factor does not.
     """
     count = len(learner.collection.factors)
     shapes = np.stack([_exact_factor(learner, rows, j, exact) for j in range(count)], axis=1)
@@ -271,3 +267,51 @@ def model_times(collection: Collection, composite: Model, eta: float) -> dict[st
             return times
     finally:
         torch.set_num_threads(threads)
+
+
+def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray) -> dict[str, NDArray]:
+    """Return the test shapes with the least, the median and the largest error next to the exact shapes.
+
+    Vertices (n, V, 3) are aligned to exact ones; ``errors`` (n, V) are their distances, ``index`` (n,) the samples'
+    indices.
+    """
+    order = np.argsort(errors.mean(axis=1))
+    chosen = order[[0, len(order) // 2, -1]]
+    return {
+        "test_index": index[chosen],
+        "test_exact": exact[chosen],
+        "test_predicted": predicted[chosen],
+        "test_error": errors[chosen],
+    }
+
+
+def strip(collection: Collection, composite: Composite, eta: float) -> dict[str, NDArray]:
+    """Interpolate between two codes, jointly and by each factor alone, as in the paper's figure of SCAPE.
+
+    The reconstruction of each frame starts from the previous frame. Returns ``strip_joint`` (T, V, 3) and
+    ``strip_factors`` (J, T, V, 3), aligned to the reference.
+    """
+    coordinates = collection.coordinates
+    ends = coordinates.uniform(2, np.random.default_rng(0))
+    codes = torch.as_tensor(np.linspace(ends[0], ends[1], STRIP_FRAMES), dtype=torch.float32)
+    with torch.no_grad():
+        factors = composite.factor_shapes(codes)
+        joint = composite.combiner(factors)
+    reconstruct = Reconstructor(collection.reference, eta)
+    rows = [joint, *factors.transpose(0, 1)]
+    shapes = np.array([_sequence(reconstruct, z.double().numpy(), collection) for z in rows])
+    return {"strip_joint": shapes[0], "strip_factors": shapes[1:]}
+
+
+def _sequence(reconstruct: Callable, rows: FloatArray, collection: Collection) -> FloatArray:
+    reference = collection.reference
+    # The first frame is reached from the reference through three intermediate shapes.
+    rest = nric(reference.vertices, reference.connectivity)
+    start = reference.vertices
+    for share in (0.25, 0.5, 0.75):
+        start = reconstruct(rest + share * (rows[0] - rest), start, tolerance=1e-4).vertices
+    frames = []
+    for z in rows:
+        start = reconstruct(z, start, tolerance=1e-5).vertices
+        frames.append(align(start, reference.vertices))
+    return np.array(frames)

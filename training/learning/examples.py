@@ -52,13 +52,7 @@ class ExampleCorrectedCombiner(CombinerNetwork):
     units: Tensor  # (n, 1) factors of the weights
 
     def __init__(self, combiner: CombinerNetwork, factors: Tensor, missed: Tensor) -> None:
-        """Fit the Gaussians.
-
-        Args:
-            combiner: Ψ.
-            factors: (n, J, 2E) factor shapes of n examples.
-            missed: (n, 2E) exact NRIC of the examples minus the output of Ψ.
-        """
+        """Fit the Gaussians to factor shapes (n, J, 2E), and exact NRIC minus the output of Ψ, ``missed`` (n, 2E)."""
         super().__init__(combiner.scaling, combiner.settings, combiner.correction, combiner.tried)
         scaling, missed = self.scaling, missed * self.scaling.factor
         largest = missed.square().sum(dim=1).argsort(descending=True, stable=True)[: GAUSSIANS.examples]

@@ -1,7 +1,5 @@
 """Export trained networks as the ONNX files of a bundle, and check that ONNX and PyTorch agree."""
 
-from __future__ import annotations
-
 import logging
 import warnings
 from dataclasses import replace
@@ -79,10 +77,8 @@ def _narrow(graph: onnx.GraphProto) -> None:
 
 
 def _answer(file: bytes, names: Network, rows: NDArray) -> NDArray:
-    """Return the output of an ONNX file for some rows, computed as on a server."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-    answer: NDArray = session.run([names.output], {names.input: rows})[0]
-    return answer
+    return session.run([names.output], {names.input: rows})[0]
 
 
 def difference(composite: Composite, networks: Networks, latents: Tensor, norm: WeightedNorm) -> float:
@@ -121,11 +117,8 @@ def export(
 ) -> Path:
     """Write ``models/NAME/VERSION/``, replacing a bundle that is there.
 
-    The digest is the SHA-256 of the training samples.
-
-    Raises:
-        ExportError: ONNX and PyTorch differ by more than the tolerance at a code, the bundle contradicts itself, or
-            a code inside the bounds has no shape.
+    The digest is the SHA-256 of the training samples. Raises ExportError if ONNX and PyTorch differ by more than the
+    tolerance at a code, the bundle contradicts itself, or a code inside the bounds has no shape.
     """
     settings, reference = config.export, collection.reference
     try:

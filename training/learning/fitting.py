@@ -1,7 +1,5 @@
 """Gradient descent: the training loop, and the files of networks, from which a killed run continues."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence
@@ -79,19 +77,9 @@ def fit(
     With a last layer of low rank and orthonormal basis, this differs by a constant from the loss on z. An unfinished
     file at ``path`` is continued: it holds parameters, moments, schedule, random state and history.
 
-    Args:
-        network: network with its initial parameters.
-        inputs: (n, …) inputs of all samples.
-        z: (n, 2E) NRIC of all samples.
-        train: (n_train,) indices of the training samples.
-        validation: (n_validation,) indices of the samples that choose the learning rate and the epoch.
-        settings: learning rate, number of epochs, batch size.
-        path: safetensors file of the result.
-        title: title of the progress bar.
-        seed: seed of the order of batches and of dropout.
-
-    Returns:
-        The state, see `SavedNetwork`.
+    Inputs (n, …) and NRIC z (n, 2E) are of all samples. ``train`` and ``validation`` are indices of samples; the
+    validation samples choose the learning rate and the epoch. The seed determines the order of batches and dropout.
+    Returns the state, see `SavedNetwork`.
     """
     with torch.no_grad():
         target = network.target(z)
@@ -145,7 +133,6 @@ def fit(
 
 
 def _optimisers(network: nn.Module, settings: FitSettings) -> list[Optimizer]:
-    """Return the optimisers; each updates a part of the parameters."""
     parameters = list(network.parameters())
     if settings.optimiser == "adam":
         return [Adam(parameters, settings.learning_rate)]

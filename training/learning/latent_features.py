@@ -1,7 +1,5 @@
 """Functions of latent codes: the inputs of perceptrons and of linear layers."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

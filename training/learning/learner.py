@@ -1,7 +1,5 @@
 """The networks of a run, each fitted to the samples once and then read from its file."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Sequence
@@ -92,8 +90,7 @@ class Learner:
     @cached_property
     def _closing(self) -> sparse.csr_array:
         """Derivatives (q, 2E) of the closing conditions around vertices, at the reference."""
-        conditions = Integrability(self.collection.reference.connectivity)
-        return conditions.jacobian(self._reference)[: 3 * len(conditions.vertices)]
+        return Integrability(self.collection.reference.connectivity).jacobian(self._reference)
 
     def _path(self, kind: str, shares: Sequence[float], *settings: BaseModel) -> Path:
         decides = [self.data_key, shares, self.seed]
@@ -279,7 +276,6 @@ class Learner:
         return Slopes(scaling.down(shapes[rows]), indices, own * scaling.factor, missed * scaling.factor)
 
     def _with_images(self, data: TrainingData) -> TrainingData:
-        """Add the images of the training samples under each symmetry of the collection."""
         inputs, z, train = data.inputs, data.z, data.rows["train"]
         rows = dict(data.rows)
         for edges in self.collection.symmetries:
@@ -311,7 +307,6 @@ class Learner:
         return self._joint_network("monolithic-paper", self.config.monolithic_paper)
 
     def _joint_network(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
-        """Return a network from all latents, fitted to the joint samples."""
         index = list(range(len(self.collection.coordinates)))
         path = self._path(kind, [self.share], settings)
         return self._latent_network(settings, index, path, self.share, lambda: (self.joint, self.rows))

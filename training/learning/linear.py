@@ -45,12 +45,8 @@ def ridge(gram: Tensor, right: Tensor, held_out: tuple[Tensor, Tensor], penaltie
     With features X (n, p) of samples and values Y (n, q), these are the normal equations if G = XᵀX and R = XᵀY. They
     are the dual form, or kernel ridge regression, if G = XXᵀ and R = Y.
 
-    Args:
-        gram: G (p, p), positive semi-definite.
-        right: R (p, q).
-        held_out: features (m, p) of held-out samples, or their kernels (m, n) with the samples; and their values (m,
-            q).
-        penalties: candidates for λ > 0.
+    G is (p, p), positive semi-definite, and R is (p, q). Held-out pairs are features (m, p), or kernels (m, n) with the
+    samples, and values (m, q). All penalties are above 0.
     """
     features, wanted = held_out
 
@@ -67,12 +63,8 @@ def kernel_ridge(
 ) -> Ridge:
     """Return weights (n, q) of functions that are not orthonormal; the penalty is on the norm of their sum.
 
-    Args:
-        gram: (n, n) inner products of the functions.
-        features: (m, n) values of the functions at samples, or their derivatives.
-        values: (m, q) values to fit.
-        held_out: features and values that choose one of the penalties.
-        penalties: candidates.
+    The functions have inner products ``gram`` (n, n). Their values at samples, or their derivatives, are features (m,
+    n), which are fitted to values (m, q). Held-out pairs choose the penalty.
     """
     # Almost dependent functions are distinguished down to rounding errors.
     half = torch.linalg.cholesky(gram + JITTER * gram.trace() * torch.eye(len(gram)))
@@ -88,12 +80,8 @@ def rounded(weights: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     spoil their sums. So weights are rounded one after the other, and the remaining weights compensate each error at
     the samples as well as they can (Frantar et al., GPTQ, ICLR 2023).
 
-    Args:
-        weights: (n, q) weights of functions.
-        features: (m, n) values of the functions at samples.
-
-    Returns:
-        Integers (n, q), factors of rows (n, 1) and factors of columns (1, q).
+    Weights (n, q) are of functions with values (m, n) at samples, the features. Returns integers (n, q), factors of
+    rows (n, 1) and factors of columns (1, q).
     """
     gram = features.T @ features
     order = gram.diagonal().argsort(descending=True)

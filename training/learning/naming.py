@@ -1,7 +1,5 @@
 """Names of factors and coordinates in a bundle: by the sides of the body, and by the configuration."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
@@ -23,11 +21,8 @@ def bundle_names(
 ) -> tuple[dict[str, list[int]], list[str]]:
     """Return the factors and the names of coordinates (m,) in the bundle.
 
-    Args:
-        factors: coordinates by the factor's name in the run.
-        coordinates: (m,) names. A name that begins with the name of its factor is renamed with the factor.
-        settings: ``faces`` and ``up`` turn sides into the body's own; ``names`` renames single factors and
-            coordinates.
+    A coordinate whose name begins with the name of its factor is renamed with the factor. The settings ``faces`` and
+    ``up`` turn sides into the body's own, and ``names`` renames single factors and coordinates.
 
     Raises:
         NamingError: an unknown name, or one name for two.
@@ -72,5 +67,4 @@ def _of_the_body(name: str, settings: ExportSettings) -> str:
 
 
 def _direction(axis: str) -> FloatArray:
-    """Return the unit vector (3,) of an axis such as "+y"."""
     return (1.0 if axis[0] == "+" else -1.0) * np.eye(3)["xyz".index(axis[1])]

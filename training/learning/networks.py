@@ -1,7 +1,5 @@
 """Factor networks, which also serve as monolithic baselines, and the start network (paper, sections 3 and 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -96,10 +94,8 @@ class FactorNetwork(ShapeNetwork):
     def penalise(self, basis: PatchBasis, closing: sparse.csr_array, weight: float) -> None:
         """Give more weight to errors that are not the change of any surface.
 
-        Args:
-            basis: the last layer.
-            closing: (q, 2E) derivatives of the closing conditions by NRIC, see `Integrability`.
-            weight: weight of their squares, relative to the mean square of errors that are equal in all directions.
+        ``closing`` (q, 2E) are derivatives of the closing conditions by NRIC, see `Integrability`. The weight of their
+        squares is relative to the mean square of errors that are equal in all directions.
         """
         each = (basis(torch.eye(basis.rank)) - basis.mean) * self.scaling.inverse
         change = closing @ each.double().numpy().T

@@ -1,7 +1,5 @@
 """Cards of a run's report: pictures of shapes, with the figures that belong to them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Charts of a run's report, as SVG elements that inherit the page's font and colours."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -29,12 +27,8 @@ STYLE: dict[Any, Any] = {
 
 
 def plot(alt: str, draw: Callable[[Axes], Any], size: tuple[float, float] = (3.5, 2.2)) -> Markup:
-    """Return an SVG element.
-
-    Args:
-        alt: alternative text for screen readers.
-        draw: draws into the axes.
-        size: width and height in inches, which fixes the size of text relative to the plot.
+    """Return an SVG element. Width and height in inches fix the size of text relative to the plot. Screen readers read
+    ``alt``.
     """
     file = io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": alt}):

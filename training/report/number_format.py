@@ -1,7 +1,5 @@
 """Numbers in the words of a report: digits, percent, durations and sizes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Any

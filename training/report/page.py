@@ -1,7 +1,5 @@
 """The report of a run: ``report.html``, one self-contained file of pictures, charts and tables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +44,8 @@ CORRECTIONS = {
 
 
 def write_report(run: RunDirectory) -> Path:
-    """Write ``report.html`` from the files of a run, finished or not, and return its path.
-
-    Raises:
-        ReportError: the folder is no run directory, or a file in it can't be read.
+    """Write ``report.html`` from the files of a run, finished or not, and return its path. Raises ReportError if the
+    folder is no run directory, or a file in it can't be read.
     """
     run.report.write(page(Record(run)))
     return run.report.path
@@ -117,7 +113,6 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
 
 
 def _correction(correction: dict[str, Any]) -> str:
-    """Return sentences on how the factors are joined, and why."""
     kind, tried = correction["kind"], correction.get("tried", {})
     sentence = f"Factors are joined by {CORRECTIONS.get(kind, kind)}"
     if kind not in tried:

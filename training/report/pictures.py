@@ -54,15 +54,8 @@ class Studio:
     ) -> NDArray[np.uint8]:
         """Draw a shape (V, 3), or several shapes (T, V, 3) side by side.
 
-        Args:
-            shape: the vertices.
-            size: pixels of the longer side of one shape's picture.
-            colours: a name, or sRGB (…, V, 3) between 0 and 1.
-            faces: (F, 3); the run's if left out.
-            smooth: see `Camera.render`.
-
-        Returns:
-            (height, width, 4) sRGB and coverage.
+        The longer side of one shape's picture has ``size`` pixels. Colours are a name, or sRGB (…, V, 3) between 0 and
+        1. Returns (height, width, 4) sRGB and coverage. See `Camera.render`.
         """
         faces = self.faces if faces is None else faces
         shapes = shape.reshape(-1, *shape.shape[-2:])

@@ -1,7 +1,5 @@
 """The files of a run's directory, as the report needs them."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import deque
 from collections.abc import Callable
@@ -51,10 +49,8 @@ def _read(file: JsonFile | NpzFile) -> dict[str, Any]:
 
 
 class Record:
-    """The results that a run has written so far; missing results are empty or None.
-
-    Raises:
-        ReportError: the folder is no run directory, or a file in it can't be read.
+    """The results that a run has written so far; missing results are empty or None. Raises ReportError if the folder is
+    no run directory, or a file in it can't be read.
     """
 
     def __init__(self, run: RunDirectory) -> None:

@@ -83,15 +83,9 @@ class Camera:
     ) -> NDArray[np.uint8]:
         """Draw a shape on a transparent background.
 
-        Args:
-            vertices: (V, 3) positions.
-            faces: (F, 3) vertex indices.
-            colours: (V, 3) or (3,) sRGB between 0 and 1.
-            size: pixels of the picture's longer side.
-            smooth: shade by normals of vertices instead of normals of faces, which show the triangles.
-
-        Returns:
-            (height, width, 4) sRGB and coverage.
+        Colours, (V, 3) or (3,), are sRGB between 0 and 1. The picture's longer side has ``size`` pixels. If not
+        ``smooth``, shading is by normals of faces, which show the triangles. Returns (height, width, 4) sRGB and
+        coverage.
         """
         # Imported here, because everything but pictures also works on platforms without this package.
         from embreex.mesh_construction import TriangleMesh

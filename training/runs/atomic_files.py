@@ -3,8 +3,6 @@
 A file can be damaged all the same, by a disk or a copy. Whoever reads it learns which one: DamagedFileError.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,11 +18,7 @@ from shapespace.files.npz import read_npz
 
 
 class DamagedFileError(ValueError):
-    """A file of a run that can't be understood.
-
-    Attributes:
-        path: the file.
-    """
+    """A file of a run that can't be understood, with its path."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path} is damaged; run the same command again, which makes it anew")

@@ -90,12 +90,8 @@ def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
 
     ``data`` replaces ``collection.data``.
 
-    Returns:
-        The configuration, and a text with the same meaning in any folder: ``collection.data`` is absolute, all else as
-        it stands in the file.
-
-    Raises:
-        ConfigError: naming the file and every faulty setting.
+    Returns the configuration, and a text with the same meaning in any folder: ``collection.data`` is absolute, all else
+    as it stands in the file. Raises ConfigError, which names the file and every faulty setting.
     """
     try:
         text = path.read_text(encoding="utf-8")

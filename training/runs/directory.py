@@ -67,10 +67,8 @@ class RunDirectory:
         return self.folder / "stages"
 
     def begin(self) -> None:
-        """Make the folder a run directory, with what says so before anything else.
-
-        Raises:
-            NotARunError: it holds something, and no run began it. Nothing is written or removed.
+        """Make the folder a run directory, with what says so before anything else. Raises NotARunError if it holds
+        something, and no run began it. Nothing is written or removed.
         """
         # A run that was killed at its begin has left the folder of stamps and no configuration.
         if self.folder.exists() and not self.was_begun() and {path.name for path in _entries(self.folder)} - {"stages"}:
@@ -203,8 +201,7 @@ class RunDirectory:
     def own_shapes(self) -> FloatArray:
         """Read the shapes (n, V, 3) of the collection, without mirror images."""
         shapes = self.shapes.read()
-        found: FloatArray = shapes["vertices"][: shapes["original"].max() + 1]
-        return found
+        return shapes["vertices"][: shapes["original"].max() + 1]
 
     def mean_mesh(self) -> TriangleMesh:
         """Read the coarse mesh at the mean shape."""

@@ -189,8 +189,7 @@ class AutoSettings(SettingsTable):
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
 ResolvedCorrection = Annotated[
-    KernelSettings | ProductSettings | ConvolutionSettings | FieldSettings,
-    Field(discriminator="kind"),
+    KernelSettings | ProductSettings | ConvolutionSettings | FieldSettings, Field(discriminator="kind")
 ]
 CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
 

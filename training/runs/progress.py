@@ -1,7 +1,5 @@
 """Progress bars: silent in the first seconds, then with an estimate of the remaining time."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterable, Iterator

@@ -37,36 +37,26 @@ class SamplesError(RuntimeError):
 
 @dataclass(frozen=True)
 class SampledShapes:
-    """Shapes of a collection.
+    """Shapes of a collection."""
 
-    Attributes:
-        vertices: (n, V, 3); where a shape could not be found, the last finite shape on the way to it.
-        nric: (n, 2E) lengths and angles. Angles are defined up to 2π. The collection chooses the value: the nearest to
-            the reference's angle, or the value at the end of a path from the reference.
-        reasons: (n,) why the shape was not found, or an empty string.
-        derivatives: (n, m, 2E) derivatives of ``nric`` by the code, zero where a shape failed; None where they are not
-            computed.
-    """
-
-    vertices: FloatArray
+    vertices: FloatArray  # (n, V, 3); where a shape could not be found, the last finite shape on the way to it
+    # (n, 2E) lengths and angles. Angles are defined up to 2π. The collection chooses the value: the nearest to the
+    # reference's angle, or the value at the end of a path from the reference.
     nric: FloatArray
-    reasons: list[str]
+    reasons: list[str]  # (n,) why the shape was not found, or an empty string
+    # (n, m, 2E) derivatives of ``nric`` by the code, zero where a shape failed; None where they are not computed
     derivatives: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class FeaturePositions:
-    """Places of a collection's features on the surface. A code moves a feature to the edges with the same place.
+    """Places of a collection's features on the surface. A code moves a feature to the edges with the same place."""
 
-    Attributes:
-        surface: (E, d) angles that tell edges apart.
-        multiples: (m, d) multiples of these angles, whose sum is the place for a coordinate, in radians of its period.
-        constants: (E, c) further properties of edges. They are equal for edges that a symmetry of codes and places
-            takes to each other.
-    """
-
-    surface: FloatArray
+    surface: FloatArray  # (E, d) angles that tell edges apart
+    # (m, d) multiples of these angles, whose sum is the place for a coordinate, in radians of its period
     multiples: IntArray
+    # (E, c) further properties of edges. They are equal for edges that a symmetry of codes and places takes to each
+    # other.
     constants: FloatArray
 
     @property
@@ -123,28 +113,20 @@ class Collection(Protocol):
 
 @dataclass(frozen=True)
 class Samples:
-    """Finished samples, in the order of their index, without failed ones.
+    """Finished samples, in the order of their index, without failed ones."""
 
-    Attributes:
-        index: (n,) increasing. Samples of two folders with the same index belong to the same joint code. It is below 0
-            for codes of the collection's own shapes.
-        latents: (n, m) codes of the shapes.
-        asked: (n, m) requested codes; farther from 0 than ``latents`` where a requested code had no shape.
-        nric: (n, 2E) lengths and angles.
-        vertices: (n, V, 3).
-    """
-
+    # (n,) increasing. Samples of two folders with the same index belong to the same joint code. It is below 0 for codes
+    # of the collection's own shapes.
     index: IntArray
-    latents: FloatArray
-    asked: FloatArray
-    nric: NDArray[np.float32]
-    vertices: NDArray[np.float32]
+    latents: FloatArray  # (n, m) codes of the shapes
+    asked: FloatArray  # (n, m) requested codes; farther from 0 than ``latents`` where a requested code had no shape
+    nric: NDArray[np.float32]  # (n, 2E) lengths and angles
+    vertices: NDArray[np.float32]  # (n, V, 3)
 
     @property
     def shortened(self) -> NDArray[np.bool_]:
         """Whether each code (n,) was shortened."""
-        found: NDArray[np.bool_] = (self.latents != self.asked).any(axis=1)
-        return found
+        return (self.latents != self.asked).any(axis=1)
 
 
 def draw(
@@ -163,21 +145,12 @@ def draw(
     Each part is written as soon as it is finished, in any order. It has the status of each sample, done or failed, and
     the reason of a failure. Parts of other codes or of another part size are removed.
 
-    Args:
-        collection: the collection; sent to the workers.
-        folder: folder of the parts.
-        latents: (n, m) codes.
-        part_size: number of codes in a part. A worker computes one part at a time, and loses it if it dies.
-        title: title of the progress bar.
-        shorten: whether a code without a shape is shortened until it has one, see SHORTER. The sample has both codes.
-        scheduler: see workers.run.
-        workers: see workers.run.
+    A worker computes one part of ``part_size`` codes at a time, and loses it if it dies. If ``shorten``, a code without
+    a shape is shortened until it has one, see SHORTER. The sample has both codes. For scheduler and workers see
+    workers.run.
 
-    Yields:
-        (done, total, failed) after each part; done includes failed.
-
-    Raises:
-        workers.WorkersError: there are no workers. Finished parts stay.
+    Yields (done, total, failed) after each part; done includes failed. Raises workers.WorkersError if there are no
+    workers. Finished parts stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
     indices = np.split(np.arange(len(latents)), range(part_size, len(latents), part_size))

@@ -51,11 +51,9 @@ def run(
 
     Each thread unpickles the function once and keeps it, so that lazily built attributes are built once in each thread
     and needn't be thread-safe. Without the address of a Dask scheduler all is computed on this machine, in as many
-    processes as it has cores unless ``workers`` says otherwise; 1 computes in this process.
-
-    Raises:
-        WorkersError: the scheduler can't be reached or is lost, there are no workers, workers lack this package, or an
-            item kills them repeatedly.
+    processes as it has cores unless ``workers`` says otherwise; 1 computes in this process. Raises WorkersError if the
+    scheduler can't be reached or is lost, there are no workers, workers lack this package, or an item kills them
+    repeatedly.
     """
     if scheduler is not None and items:
         return _on_cluster(PickledFunction(function), items, scheduler)

@@ -1,7 +1,5 @@
 """Codes of the shapes of a collection: their exponentials come closest to the shapes, in vertices."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -30,19 +28,12 @@ SMALLEST_SIDE = 0.1
 
 @dataclass(frozen=True)
 class Codes:
-    """Codes of shapes, and their exponentials.
+    """Codes of shapes, and their exponentials."""
 
-    Attributes:
-        codes: (n, m).
-        vertices: (n, V, 3) exponentials of the codes, aligned to the shapes.
-        exponentials: (n,) number of exponentials of each search.
-        status: (n,) status of each search.
-    """
-
-    codes: FloatArray
-    vertices: FloatArray
-    exponentials: tuple[int, ...]
-    status: tuple[Status, ...]
+    codes: FloatArray  # (n, m)
+    vertices: FloatArray  # (n, V, 3) exponentials of the codes, aligned to the shapes
+    exponentials: tuple[int, ...]  # (n,) number of exponentials of each search
+    status: tuple[Status, ...]  # (n,) status of each search
 
 
 def nearest_codes(
@@ -80,12 +71,7 @@ def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _nearest(
-    space: ShellSpace,
-    mean: FloatArray,
-    modes: FloatArray,
-    box: Box,
-    steps: int,
-    item: tuple[FloatArray, FloatArray],
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, box: Box, steps: int, item: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray, int, Status]:
     target, start = item
 

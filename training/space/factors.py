@@ -4,8 +4,6 @@ For modes that move different parts of a surface, the exponential of the sum is 
 does not hold for modes that move the same part. Such modes form one factor, and one network learns it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 
@@ -33,10 +31,8 @@ class FactorError(ValueError):
 def overlap(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
     """Overlap of the supports of modes: ``Σ_e |u_i,e| |u_j,e|``, normalised to 1 on the diagonal.
 
-    ``|u_e|`` is the size of a mode (2E,) on an edge, of its length and its angle together, in the norm at the mean.
-
-    Returns:
-        (m, m) symmetric, from 0 where supports are disjoint to 1 where the modes are alike.
+    ``|u_e|`` is the size of a mode (2E,) on an edge, of its length and its angle together, in the norm at the mean. The
+    result (m, m) is symmetric, from 0 where supports are disjoint to 1 where the modes are alike.
     """
     sizes = edge_magnitudes(nric, norm)
     sizes /= np.linalg.norm(sizes, axis=1, keepdims=True)
@@ -60,11 +56,8 @@ def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
     little with everything else, and 0.1 on a hand. The algorithm is written out because a dendrogram has no limit on
     the size of groups.
 
-    Returns:
-        J lists of modes, each in order; the factor of the strongest mode comes first.
-
-    Raises:
-        FactorError: the count is not possible.
+    Returns J lists of modes, each in order; the factor of the strongest mode comes first. Raises FactorError if the
+    count is not possible.
     """
     m = len(overlaps)
     if count is not None and not 1 <= count <= m:

@@ -47,17 +47,11 @@ FOLDED_SHARE, FOLDED_SHAPES, FOLDED_MODES = 0.1, 500, 10
 
 @dataclass(frozen=True)
 class PrincipalComponents:
-    """Principal components of shapes aligned to their mean.
+    """Principal components of shapes aligned to their mean."""
 
-    Attributes:
-        mean: (V, 3).
-        axes: (n, 3V) orthonormal, strongest first.
-        coefficients: (n, n) coefficients of the shapes.
-    """
-
-    mean: FloatArray
-    axes: FloatArray
-    coefficients: FloatArray
+    mean: FloatArray  # (V, 3)
+    axes: FloatArray  # (n, 3V) orthonormal, strongest first
+    coefficients: FloatArray  # (n, n) coefficients of the shapes
 
     def explained(self, count: int) -> float:
         """Return the share of the shapes' variance that the first components explain."""
@@ -88,8 +82,7 @@ class PrincipalComponents:
 
 def vertex_distances(shapes: FloatArray, others: FloatArray, diagonal: float) -> FloatArray:
     """Return distances (n, V) between shapes (n, V, 3) and others, (n, V, 3) or (V, 3), as shares of a diagonal."""
-    result: FloatArray = np.linalg.norm(align(shapes, others) - others, axis=-1) / diagonal
-    return result
+    return np.linalg.norm(align(shapes, others) - others, axis=-1) / diagonal
 
 
 def to_nearest(shapes: FloatArray, collection: FloatArray, diagonal: float) -> float:
@@ -111,22 +104,15 @@ def folds(count: int) -> list[IntArray]:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out shapes, approximated in the space that was found without them.
+    """Held-out shapes, approximated in the space that was found without them."""
 
-    Attributes:
-        index: (k,) indices of the shapes in the collection.
-        counts: numbers of modes.
-        near: (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as
-            many principal components, and ``mirrored_components`` those of the shapes and their mirror images, where
-            there are any.
-        steps: (k,) K of the exponentials.
-        stuck: (k,) for each number: whether the search did not converge, because faces of exponentials collapse.
-    """
-
-    index: IntArray
-    counts: Sequence[float]
+    index: IntArray  # (k,) indices of the shapes in the collection
+    counts: Sequence[float]  # numbers of modes
+    # (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as many
+    # principal components, and ``mirrored_components`` those of the shapes and their mirror images, where there are any
     near: dict[str, list[FloatArray]]
-    steps: IntArray
+    steps: IntArray  # (k,) K of the exponentials
+    # (k,) for each number: whether the search did not converge, because faces of exponentials collapse
     stuck: list[NDArray[np.bool_]]
 
     def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
@@ -202,10 +188,8 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> 
 def _space(
     reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
-    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3).
-
-    Raises:
-        ModeError: the shapes have no mean.
+    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3). Raises ModeError
+    if the shapes have no mean.
     """
     found = centred_mean(reference, shapes, material, steps)
     if found.status is not Status.CONVERGED:
@@ -243,10 +227,8 @@ def held_out(
 
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
-    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`.
-
-    Raises:
-        ModeError: the other shapes have no mean, or no modes.
+    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`. Raises
+    ModeError if the other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))

@@ -1,7 +1,5 @@
 """The shapes of a collection as tangent vectors at their mean: the discrete logarithms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
@@ -30,21 +28,14 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True)
 class Logarithms:
-    """Discrete logarithms of the shapes of a collection at their mean.
+    """Discrete logarithms of the shapes of a collection at their mean."""
 
-    Attributes:
-        fields: (n, V, 3) vertex fields, without rigid motion.
-        status: (n,) status of the last geodesic tried. If it is not CONVERGED, the field is the linearised logarithm.
-        steps: (n,) K of the geodesic found, 0 where none was found.
-        via: (n,) neighbour whose geodesic was the initial value, −1 where none was needed.
-        reasons: (n,) why the geodesic was not found from the straight line, or an empty string.
-    """
-
-    fields: FloatArray
+    fields: FloatArray  # (n, V, 3) vertex fields, without rigid motion
+    # (n,) status of the last geodesic tried. If it is not CONVERGED, the field is the linearised logarithm.
     status: tuple[Status, ...]
-    steps: tuple[int, ...]
-    via: tuple[int, ...]
-    reasons: tuple[str, ...]
+    steps: tuple[int, ...]  # (n,) K of the geodesic found, 0 where none was found
+    via: tuple[int, ...]  # (n,) neighbour whose geodesic was the initial value, −1 where none was needed
+    reasons: tuple[str, ...]  # (n,) why the geodesic was not found from the straight line, or an empty string
 
     @property
     def fallbacks(self) -> list[int]:
@@ -70,10 +61,7 @@ def logarithms(space: ShellSpace, mean: FloatArray, shapes: ArrayLike, steps: in
     1/K: on real collections, logarithms of 4 and of 8 steps differ by 10 to 35 % of their length.
 
     Shapes (n, V, 3) may be in any position; the mean is (V, 3). The result does not depend on the number of workers.
-
-    Raises:
-        ModeError: a coordinate of a shape is not finite.
-        WorkersError: processes are killed repeatedly.
+    Raises ModeError if a coordinate of a shape is not finite, and WorkersError if processes are killed repeatedly.
     """
     x = np.stack([space.shape(shape) for shape in np.asarray(shapes, dtype=np.float64)])
     bad = np.flatnonzero(~np.isfinite(x).all(axis=(1, 2)))

@@ -1,7 +1,5 @@
 """The mean of a collection, where its tangent space is attached."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from shapespace.arrays import FloatArray
@@ -25,9 +23,7 @@ def centred_mean(
     tenth, with twelve modes.
 
     The reference gives connectivity, shapes (n, V, 3) may be in any position, and ``steps`` is K of the logarithms.
-
-    Returns:
-        The mean, with the status of the elastic mean. Without an exponential it is the elastic mean itself.
+    Returns the mean with the status of the elastic mean; without an exponential it is the elastic mean itself.
     """
     with waiting("elastic mean"):
         found = elastic_mean(ShellSpace(reference, material), shapes)

@@ -18,8 +18,6 @@ nearly zero.
 `sparse_modes` finds modes that each move a small part of the surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -59,24 +57,16 @@ class Modes:
 
     Each mode is scaled so that the largest coefficient of a shape is 1, and positive. There may be fewer modes than
     asked for, because a mode that carries nothing is left out.
-
-    Attributes:
-        nric: (m, 2E) changes u_j of lengths and angles.
-        vertices: (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j.
-        coefficients: (n, m) orthogonal projections, in the norm, of the shapes' logarithms.
-        explained: share of ``Σ ‖v^i‖²`` that the projections keep.
-        converged: whether the iteration converged.
-        sparsity: λ, see ``spga``.
-        history: one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective
-            = misfit + penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``.
     """
 
-    nric: FloatArray
-    vertices: FloatArray
-    coefficients: FloatArray
-    explained: float
-    converged: bool = True
-    sparsity: float = 0.0
+    nric: FloatArray  # (m, 2E) changes u_j of lengths and angles
+    vertices: FloatArray  # (m, V, 3) vertex fields d_j, without rigid motion, u_j = J d_j
+    coefficients: FloatArray  # (n, m) orthogonal projections, in the norm, of the shapes' logarithms
+    explained: float  # share of ``Σ ‖v^i‖²`` that the projections keep
+    converged: bool = True  # whether the iteration converged
+    sparsity: float = 0.0  # λ, see ``spga``
+    # one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective = misfit +
+    # penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``
     history: list[dict[str, float]] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:
@@ -84,10 +74,8 @@ class Modes:
 
 
 def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm = "mixed") -> Modes:
-    """Find at most ``count`` modes whose span comes closest to logarithms (n, V, 3) at a mean (V, 3), in a norm.
-
-    Raises:
-        ModeError: the count, at most n, is not possible, or all fields are zero.
+    """Find at most ``count`` modes whose span comes closest to logarithms (n, V, 3) at a mean (V, 3), in a norm. Raises
+    ModeError if the count, at most n, is not possible, or all fields are zero.
     """
     problem = ModeProblem(space, mean, fields, count, norm)
     return problem.modes(problem.principal(count)[0])
@@ -105,15 +93,9 @@ def mode_count(
     The choice m minimises ``error(m) + WORTH · m``. The error is the distance between held-out logarithms and the span
     of m principal modes of the other shapes, as a share of the logarithms' length. No exponentials are computed.
 
-    Args:
-        settings: settings of the modes; only ``count`` and ``norm`` matter.
-        space: the shape space.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        original_index: (n,) index of each shape's original, from 0; a shape and its mirror image are held out together.
-
-    Raises:
-        ModeError: the fields can't be used.
+    Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. ``original_index`` (n,)
+    is the index of each shape's original, from 0: a shape and its mirror image are held out together. Raises ModeError
+    if the fields can't be used.
     """
     if settings.count != "auto":
         return max(1, min(settings.count, len(fields) - 1))
@@ -133,11 +115,8 @@ def coefficients(
 ) -> tuple[FloatArray, float]:
     """Project logarithms (n, V, 3) orthogonally onto the span of modes (m, V, 3), at a mean (V, 3).
 
-    Returns:
-        Coefficients (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep.
-
-    Raises:
-        ModeError: the logarithms can't be used.
+    Returns coefficients (n, m), and the share of ``Σ ‖v^i‖²`` that the projections keep. Raises ModeError if the
+    logarithms can't be used.
     """
     problem = ModeProblem(space, mean, fields, 1, norm)
     W, explained = problem.project(problem.balanced(modes))
@@ -157,18 +136,7 @@ def localisation(nric: FloatArray, norm: WeightedNorm) -> FloatArray:
 
 
 class ModeProblem:
-    """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,).
-
-    Attributes:
-        areas: (3V,) vertex areas, 1 on average.
-        plain: weight of the norm of vertices.
-        shell: weight of the shell's metric.
-        H: (2E, 2E) the metric on lengths and angles.
-        M: (3V, 3V) the norm.
-        D: (n, 3V) the logarithms.
-        MD: (3V, n) ``M Dᵀ``.
-        total: ``Σ ‖v^i‖²``.
-    """
+    """The tangent space at a mean with the logarithms in it, all as matrices on flat vertex fields (3V,)."""
 
     def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
         self.point: ShellPoint = space.point(mean)
@@ -182,19 +150,20 @@ class ModeProblem:
         hessian = self.point.hessian
         self.form = QuadraticForm(hessian.faces / 2, hessian.angles / 2)
         self.J = space.jacobian.matrix(self.point.gradients)
-        self.H = _matrix(self.form, space.energy.sides, space.connectivity.edge_count)
+        self.H = space.energy.matrix(self.form)  # (2E, 2E) the metric on lengths and angles
         areas = vertex_areas(self.point.vertices, space.connectivity.faces)
-        self.areas = np.repeat(areas / areas.mean(), 3)
-        self.D = self.balanced(fields)
+        self.areas = np.repeat(areas / areas.mean(), 3)  # (3V,) vertex areas, 1 on average
+        self.D = self.balanced(fields)  # (n, 3V) the logarithms
         plain, metric = sparse.diags_array(self.areas), self.J.T @ self.H @ self.J
         moved, strained = (float(np.vdot(self.D.T, matrix @ self.D.T)) for matrix in (plain, metric))
         if not strained > 0:
             raise ModeError("there are no modes: all shapes are the same as the mean")
+        # Weights of the norm of vertices and of the shell's metric.
         self.plain = float(norm != "shell")
         self.shell = {"mixed": SHELL_SHARE * moved / strained, "vertices": 0.0, "shell": 1.0}[norm]
-        self.M = sparse.csr_array(self.plain * plain + self.shell * metric)
+        self.M = sparse.csr_array(self.plain * plain + self.shell * metric)  # (3V, 3V) the norm
         self.MD = self.M @ self.D.T
-        self.total = float(np.vdot(self.D.T, self.MD))
+        self.total = float(np.vdot(self.D.T, self.MD))  # ``Σ ‖v^i‖²``
 
     def balanced(self, fields: FloatArray) -> FloatArray:
         """Return fields (n, V, 3) as rows (n, 3V), each with the rigid motion that minimises the norm of vertices."""
@@ -258,11 +227,3 @@ class ModeProblem:
             converged=converged,
             history=history or [],
         )
-
-
-def _matrix(form: QuadraticForm, sides: NDArray[np.int64], edges: int) -> sparse.csr_array:
-    """Return a quadratic form as a matrix (2E, 2E)."""
-    rows = np.broadcast_to(sides[:, None], form.faces.shape).ravel()
-    columns = np.broadcast_to(sides[None], form.faces.shape).ravel()
-    lengths = sparse.csr_array((form.faces.ravel(), (rows, columns)), shape=(edges, edges))
-    return sparse.csr_array(sparse.block_diag([lengths, sparse.diags_array(form.angles)], format="csr"))

@@ -94,6 +94,5 @@ class ShellCollection:
         return SampledShapes(vertices, z, reasons, derivatives)
 
     def _derivative(self, path: DiscretePath) -> FloatArray:
-        """Return the derivatives (m, 2E) of a path's end by the code. Raises RuntimeError."""
         end = path.space.point(path.vertices[-1])
         return np.stack([end.push_forward(x) for x in ExponentialDerivative(path).push_forward(self.modes)])

@@ -25,8 +25,7 @@ most 3 %. Principal modes in inner folds estimate this error.
 What a sparsity costs in each norm is in docs/measurements/notes.md.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -63,10 +62,8 @@ def find_modes(
     count: int,
     original_index: IntArray | None = None,
 ) -> Modes:
-    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured.
-
-    Raises:
-        ModeError: the count or the sparsity is not possible.
+    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured. Raises ModeError if the count or
+    the sparsity is not possible.
     """
     if settings.sparsity == 0:
         return pga(space, mean, fields, count, settings.norm)
@@ -100,26 +97,16 @@ def spga(
     The meaning of ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. The result is
     deterministic.
 
-    Args:
-        space: the shape space; its η also weighs the angles in the 1-norm.
-        mean: X̄ (V, 3).
-        fields: (n, V, 3) logarithms.
-        count: m, at most n.
-        sparsity: λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
-            price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of
-            `SPARSITIES` by errors in vertices, or in the norm "shell" where that is the norm.
-        norm: norm of the misfit.
-        original_index: see modes.mode_count.
-        max_iterations: most rounds through all modes.
-        tolerance: see `TOLERANCE`.
-
-    Raises:
-        ModeError: the count is not possible, or the sparsity leaves no mode.
+    ``sparsity`` is λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
+    price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of `SPARSITIES` by
+    errors in vertices, or in the norm "shell" where that is the norm. Logarithms are (n, V, 3) at X̄ (V, 3), and η of
+    the space also weighs the angles in the 1-norm. For ``original_index`` see modes.mode_count, for ``tolerance`` see
+    `TOLERANCE`. Raises ModeError if the count is not possible, or the sparsity leaves no mode.
     """
     problem = _SparseProblem(space, mean, fields, count, norm)
     D, W = problem.principal(count)
     highest = problem.highest_price(D, W)
-    enough = _SparsityCriterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
+    enough = _sparsity_criterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
     for share in SPARSITIES if sparsity is None else [sparsity]:
@@ -130,18 +117,12 @@ def spga(
 
 
 class _SparseProblem(ModeProblem):
-    """A mode problem with the 1-norm.
-
-    Attributes:
-        norm: weighted norm at the mean.
-        weights: (2E,) weights of the 1-norm.
-        penalty: scale of the metric's diagonal that makes it weigh on the logarithms as much as the norm.
-        G: (2E,) the scaled diagonal.
-    """
+    """A mode problem with the 1-norm."""
 
     def __init__(self, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, norm: Norm) -> None:
         super().__init__(space, mean, fields, count, norm)
         diagonal: FloatArray = self.H.diagonal()
+        # Scale of the metric's diagonal that makes it weigh on the logarithms as much as the norm.
         self.penalty = 1.0 if norm == "shell" else self.total / float(diagonal @ ((self.J @ self.D.T) ** 2).sum(axis=1))
         self.G = self.penalty * diagonal
         eta = space.material.eta
@@ -166,25 +147,14 @@ class _SparseProblem(ModeProblem):
         return float((2 * self.energies(D, W) / self.one_norms(D)).max())
 
 
-class _SparsityCriterion:
-    """Whether sparse modes keep enough of the logarithms, compared with principal modes (m, 3V); see `SPARSITIES`."""
-
-    def __init__(
-        self,
-        space: ShellSpace,
-        mean: FloatArray,
-        fields: FloatArray,
-        D: FloatArray,
-        norm: Norm,
-        original_index: IntArray | None,
-    ) -> None:
-        self._problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
-        left = self._problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
-        self._least = self._problem.project(D)[1] - ALLOWED_ERROR * float(left) / self._problem.total
-
-    def __call__(self, D: FloatArray) -> bool:
-        """Return whether modes (m, 3V) keep enough."""
-        return self._problem.project(D)[1] >= self._least
+def _sparsity_criterion(
+    space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm, original_index: IntArray | None
+) -> Callable[[FloatArray], bool]:
+    """Whether modes (m, 3V) keep enough of the logarithms, compared with principal modes D; see `SPARSITIES`."""
+    problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
+    left = problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
+    least = problem.project(D)[1] - ALLOWED_ERROR * float(left) / problem.total
+    return lambda modes: problem.project(modes)[1] >= least
 
 
 class _Shrinkage:
@@ -219,10 +189,8 @@ class _Shrinkage:
 def _alternate(
     problem: _SparseProblem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
 ) -> tuple[bool, list[dict[str, float]]]:
-    """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block, never uphill.
-
-    Returns:
-        Whether the iteration converged, and its history, see `Modes`.
+    """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block, never uphill. Returns whether
+    the iteration converged, and its history, see `Modes`.
     """
     shrink = _Shrinkage(problem, D)
     history: list[dict[str, float]] = []

@@ -1,7 +1,5 @@
 """Stage `evaluation`: all figures of a run, from the test codes and from fresh codes."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stage `export`: the bundle, and the distance between its shapes and the collection's."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path
@@ -50,14 +48,7 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
         composite = replace(composite, combiner=combiner)
     with waiting("bundle"):
         return export(
-            composite,
-            run.collection,
-            run.config,
-            figures,
-            digest.hexdigest(),
-            run.models,
-            geometry,
-            learner.start(),
+            composite, run.collection, run.config, figures, digest.hexdigest(), run.models, geometry, learner.start()
         )
 
 

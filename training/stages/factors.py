@@ -1,7 +1,5 @@
 """Stage `factors`: groups of modes whose supports overlap, and the modes in the order of the groups."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -13,9 +11,7 @@ from shapespace.training.stages.stage import Run, Stage
 
 def find_factors(run: Run) -> None:
     """Write ``factors.json``; of meshes also ``modes.npz``, where each factor's latents are a range, as in bundles.
-
-    Raises:
-        FactorError: there are fewer modes than factors were asked for.
+    Raises FactorError if there are fewer modes than factors were asked for.
     """
     directory = run.directory
     if run.by_design:

@@ -1,7 +1,5 @@
 """Stage `generalisation`: the distance between shapes that are left out of training and the space without them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from shapespace.solve.cholesky import NotPositiveDefiniteError

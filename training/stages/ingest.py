@@ -1,7 +1,5 @@
 """Stage `ingest`: read and check the meshes, scale them, coarsen them, and prepare the way back to the fine mesh."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from typing import Any
@@ -31,10 +29,8 @@ from shapespace.training.stages.stage import Run, Stage, StageWarning
 def ingest(run: Run) -> None:
     """Write ``reference.npz``; of meshes also ``shapes.npz``, ``ingest.json``, their prolongation and their surface.
 
-    ``shapes.npz`` has normalised vertices (n, V, 3), coarsened where the settings ask for it.
-
-    Raises:
-        IngestError: the collection can't be used, or shapes of it have to be accepted first.
+    ``shapes.npz`` has normalised vertices (n, V, 3), coarsened where the settings ask for it. Raises IngestError if the
+    collection can't be used, or shapes of it have to be accepted first.
     """
     directory, settings = run.directory, run.config.collection
     if run.by_design:

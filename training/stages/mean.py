@@ -1,7 +1,5 @@
 """Stage `mean`: the mean shape, where the tangent space is attached, and the number of time steps K."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.mesh.rigid_motion import align
@@ -20,11 +18,7 @@ class MeanError(ValueError):
 
 
 def find_mean(run: Run) -> None:
-    """Write ``mean.npz``: the centred elastic mean of all shapes, and K.
-
-    Raises:
-        MeanError: the mean is not found.
-    """
+    """Write ``mean.npz``: the centred elastic mean of all shapes, and K. Raises MeanError if the mean is not found."""
     directory, material = run.directory, run.config.shell_material
     reference, given = directory.reference_mesh(), directory.shapes.read()
     shapes = given["vertices"]

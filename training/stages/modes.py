@@ -1,7 +1,5 @@
 """Stage `modes`: logarithms of the shapes at the mean, their sparse and principal modes, and codes of the shapes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -19,10 +17,8 @@ from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarn
 
 
 def decompose(run: Run) -> None:
-    """Write ``modes-by-strength.npz``, ``modes.json``, and ``modes.npz``, which `factors` puts in its order.
-
-    Raises:
-        ModeError: the collection has no modes, or none at this sparsity.
+    """Write ``modes-by-strength.npz``, ``modes.json``, and ``modes.npz``, which `factors` puts in its order. Raises
+    ModeError if the collection has no modes, or none at this sparsity.
     """
     directory, config = run.directory, run.config
     settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()

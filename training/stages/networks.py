@@ -25,9 +25,7 @@ def learner_of(run: Run) -> Learner:
 
 def train_networks(run: Run) -> None:
     """Write ``networks/``: one file for each network and all histories; files that are no longer needed are removed.
-
-    Raises:
-        SamplesError: there are too few samples to learn from.
+    Raises SamplesError if there are too few samples to learn from.
     """
     directory = run.directory
     kinds = {"joint samples": directory.samples}
@@ -59,9 +57,5 @@ def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
 # A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks
 # that it does not touch.
 STAGE = Stage(
-    name="networks",
-    version=5,
-    settings=_settings,
-    run=train_networks,
-    results=lambda run: [run.histories.path],
+    name="networks", version=5, settings=_settings, run=train_networks, results=lambda run: [run.histories.path]
 )

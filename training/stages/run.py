@@ -1,7 +1,5 @@
 """The stages of a run in order. Only stages whose settings, input or version have changed are done again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

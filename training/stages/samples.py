@@ -1,7 +1,5 @@
 """Stage `samples`: codes with their shapes, joint ones and each factor's own, and the split of the joint ones."""
 
-from __future__ import annotations
-
 import shutil
 from collections import Counter
 from typing import Any

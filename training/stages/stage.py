@@ -1,7 +1,5 @@
 """What all stages share: the description of a stage, its warnings, and the run that it works on."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Sequence
@@ -111,30 +109,23 @@ class Run:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run.
+    """One stage of a run."""
 
-    Attributes:
-        name: name on the command line and in the run directory.
-        version: version of the numerics. Raise it in the commit after which the same settings and input give other
-            numbers.
-        settings: the part of the configuration that the stage reads.
-        run: does the stage. It continues from what an interrupted call has left.
-        results: paths that are removed where the settings, the version or an earlier stage has changed. Files are
-            removed at once, because a reader would take them for current. Folders of samples are removed when the
-            stage begins, because the change may be taken back until then.
-        warnings: what the finished stage could not do, read from its files.
-        amounts: settings that may change without removing folders, since the stage adds what is missing.
-        meshes_only: whether a product by design skips the stage.
-    """
-
-    name: str
+    name: str  # name on the command line and in the run directory
+    # Version of the numerics. Raise it in the commit after which the same settings and input give other numbers.
     version: int
+    # the part of the configuration that the stage reads
     settings: Callable[[Config], Sequence[BaseModel | dict[str, Any]]]
-    run: Callable[[Run], None]
+    run: Callable[[Run], None]  # does the stage. It continues from what an interrupted call has left
+    # Paths that are removed where the settings, the version or an earlier stage has changed. Files are removed at once,
+    # because a reader would take them for current. Folders of samples are removed when the stage begins, because the
+    # change may be taken back until then.
     results: Callable[[RunDirectory], Sequence[Path]]
+    # what the finished stage could not do, read from its files
     warnings: Callable[[RunDirectory], list[StageWarning]] = lambda _: []
+    # settings that may change without removing folders, since the stage adds what is missing
     amounts: frozenset[str] = frozenset()
-    meshes_only: bool = False
+    meshes_only: bool = False  # whether a product by design skips the stage
 
     def keys(self, config: Config, before: str) -> dict[str, str]:
         """Return digests of the input of the stage: ``key`` of all input, ``basis`` of all input but the amounts.

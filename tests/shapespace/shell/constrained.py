@@ -48,7 +48,7 @@ def constrained_exponential(
         z, multipliers = 2 * path[-1] - path[-2], np.zeros(r)
         for _ in range(MAX_ITERATIONS):
             residual = np.concatenate(
-                [scale * (known + rest.gradient_rest(z) + jacobian.T @ multipliers), conditions(z)]
+                [scale * (known + rest.gradient_rest(z) + jacobian.T @ multipliers), conditions.at_vertices(z).ravel()]
             )
             step = -inverse @ residual
             z = z + scale * step[:n]

@@ -24,7 +24,7 @@ from shapespace.training.learning.combiners.combiner import CORRECTIONS, Combine
 from shapespace.training.learning.combiners.convolutions import EdgeConvolution, Flaps, Star, flaps
 from shapespace.training.learning.combiners.correction import JointSamples, Slopes
 from shapespace.training.learning.combiners.kernels import KernelCorrection
-from shapespace.training.learning.combiners.metric import learned_metric
+from shapespace.training.learning.combiners.patches import learned_metric
 from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.fitting import read_network, save_network

@@ -93,11 +93,8 @@ def _components(y: Tensor) -> int:
 class CombinerNetwork(ShapeNetwork):
     """Ψ: factor shapes (n, J, 2E) → NRIC (n, 2E) of the joint shape. Its only input are these shapes.
 
-    Args:
-        scaling: maps NRIC to scaled differences.
-        settings: settings of the correction.
-        correction: maps scaled differences of factor shapes to scaled differences of the joint shape.
-        tried: by kind, the mean square error on held-out codes in scaled differences; empty if nothing was chosen.
+    ``tried`` has, by kind, the mean square error on held-out codes in scaled differences; it is empty if nothing was
+    chosen.
     """
 
     def __init__(
@@ -169,16 +166,13 @@ class CombinerNetwork(ShapeNetwork):
         return {"correction": self.settings.model_dump_json(), "tried": json.dumps(self.tried)}
 
     def target(self, z: Tensor) -> Tensor:
-        """Return scaled differences (n, 2E) of NRIC (n, 2E)."""
         return self.scaling.down(z)
 
     def coefficients(self, inputs: Tensor) -> Tensor:
         """Return scaled differences (n, 2E) of the joint shape for factor shapes (n, J, 2E)."""
-        result: Tensor = self.correction(self.scaling.down(inputs))
-        return result
+        return self.correction(self.scaling.down(inputs))
 
     def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
-        """Return the loss of the correction, which may be an estimate."""
         return self.correction.loss(self.scaling.down(inputs), target)
 
     def forward(self, factors: Tensor) -> Tensor:

@@ -23,15 +23,9 @@ class ConvolutionCorrection(Correction):
     """Graph convolutions on edges, each followed by batch normalisation, ELU and dropout.
 
     With ``residual`` they correct the affine sum, or its correction by products, and start at zero. Without
-    ``residual`` they put out the joint shape itself, as in the paper. Features of an edge are the lengths and angles
-    of the J factors, length and angle in the reference, and learned constants.
-
-    Args:
-        settings: settings of the network.
-        reference: the reference mesh.
-        rest: (E, 2) see `JointSamples.rest`.
-        factor_count: J.
-        products: correction by products of factor shapes, added to the affine sum first.
+    ``residual`` they put out the joint shape itself, as in the paper. Features of an edge are the lengths and angles of
+    the J factors, length and angle in the reference, and learned constants. ``factor_count`` is J, and ``rest`` (E, 2)
+    is `JointSamples.rest`.
     """
 
     rest: Tensor
@@ -69,7 +63,6 @@ class ConvolutionCorrection(Correction):
         held_out: JointSamples,
         seed: int,
     ) -> ConvolutionCorrection:
-        """Return the untrained network, with fitted products; see `Correction`."""
         products = None
         if settings.products:
             how = ProductSettings(coefficients=settings.products)
@@ -80,7 +73,6 @@ class ConvolutionCorrection(Correction):
     def load(
         cls, settings: ConvolutionSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]
     ) -> ConvolutionCorrection:
-        """Return the network with these tensors; see `Correction`."""
         prefix, products = "products.", None
         if settings.products:
             own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
@@ -93,16 +85,11 @@ class ConvolutionCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Settings of the training; the products are not trained."""
         return self.settings.fit
 
     @cached_property
     def crops(self) -> Crops | None:
-        """Crops that the loss is computed on; None for whole shapes.
-
-        Raises:
-            ValueError: crops are too small.
-        """
+        """Crops that the loss is computed on; None for whole shapes. Raises ValueError if crops are too small."""
         size, table = self.settings.crop, flaps(self.reference.connectivity)
         return Crops(self.reference.edge_midpoints, table, size, self.settings.layers) if size else None
 
@@ -168,11 +155,8 @@ class EdgeConvolution(nn.Module):
                 self.other.weight /= 10
 
     def forward(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
-        """Map features (E, n, n_in) to features (E, n, n_out).
-
-        Args:
-            x: features on the whole mesh, or (n K, 1, n_in) on the edges of n crops.
-            neighbours: neighbours of a `Crop`; None for the whole mesh.
+        """Map features (E, n, n_in) to features (E, n, n_out). On the edges of n crops, x is (n K, 1, n_in), with the
+        neighbours of a `Crop`.
         """
         around = self.around(x) if neighbours is None else _side_by_side(_gather(x, neighbours))
         return self.own(x) + self.other(around)
@@ -256,7 +240,6 @@ def _gather(x: Tensor, neighbours: Tensor) -> Tensor:
 
 
 def _side_by_side(around: Tensor) -> Tensor:
-    """Reshape (E, k, n, C) to (E, n, k C)."""
     return around.transpose(1, 2).flatten(2)
 
 

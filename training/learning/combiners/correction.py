@@ -1,7 +1,5 @@
 """The interface of corrections of the affine sum, and the samples that they are fitted to."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,10 +34,6 @@ class Slopes:
         for j, index in enumerate(self.latents):
             result[:, index, j] = own[:, index] @ axes[j]
         return result.flatten(2).flatten(0, 1)
-
-    def repeated(self, inputs: Tensor) -> Tensor:
-        """Repeat rows (k, …), one for each sample, once for each latent: (k m, …)."""
-        return inputs.repeat_interleave(self.own.shape[1], dim=0)
 
 
 @dataclass(frozen=True)

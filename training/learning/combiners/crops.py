@@ -1,7 +1,5 @@
 """Crops of a mesh: connected groups of edges on which convolutions are trained."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,14 +26,9 @@ class Crop:
 class Crops:
     """Draws crops of a mesh.
 
-    Args:
-        midpoints: (E, 3) midpoints of the edges; they define the distances between neighbours.
-        neighbours: (E, k) neighbours of each edge in a convolution, E for a missing neighbour.
-        size: largest K.
-        layers: number of successive convolutions.
-
-    Raises:
-        ValueError: crops are so small that none of their edges is an inner edge.
+    Midpoints (E, 3) of the edges define the distances between neighbours. A convolution has ``neighbours`` (E, k) of
+    each edge, E for a missing neighbour. The largest K is ``size``. Raises ValueError if crops are so small that none
+    of their edges is an inner edge.
     """
 
     def __init__(self, midpoints: FloatArray, neighbours: IntArray, size: int, layers: int) -> None:

@@ -36,12 +36,8 @@ class FieldCorrection(Correction):
     The combiner's only input are the factor shapes, so codes are read from these: the cosine and the sine of a
     coordinate by a linear map of its factor's shape.
 
-    Args:
-        settings: settings of the network.
-        rest: (E, 2) see `JointSamples.rest`.
-        factor_count: J.
-        places: (E, m) angle at which each coordinate is at an edge.
-        constants: (E, c) constants of each edge.
+    ``places`` (E, m) is the angle at which each coordinate is at an edge, and ``constants`` (E, c) are constants of
+    each edge. ``factor_count`` is J, and ``rest`` (E, 2) is `JointSamples.rest`.
     """
 
     owner: Tensor
@@ -75,10 +71,8 @@ class FieldCorrection(Correction):
     def fit(
         cls, settings: FieldSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
     ) -> FieldCorrection:
-        """Return the untrained network with a fitted code reader; see `Correction`.
-
-        Raises:
-            ValueError: the collection does not know where features move.
+        """Return the untrained network with a fitted code reader; see `Correction`. Raises ValueError if the collection
+        does not know where features move.
         """
         if own.motion is None or held_out.motion is None:
             raise ValueError('kind = "field" needs a collection that knows where its coordinates are on the surface')
@@ -97,7 +91,6 @@ class FieldCorrection(Correction):
 
     @classmethod
     def load(cls, settings: FieldSettings, reference: TriangleMesh, tensors: Mapping[str, Tensor]) -> FieldCorrection:
-        """Return the network with these tensors, which determine the sizes; see `Correction`."""
         places, edges = tensors["places"], tensors["edges"]
         known = edges.shape[1] + 2 * places.shape[1] * (1 + len(settings.concentrations))
         factor_count = (tensors["perceptron.0.weight"].shape[1] - known) // 2
@@ -107,7 +100,6 @@ class FieldCorrection(Correction):
 
     @property
     def descent(self) -> FitSettings:
-        """Settings of the perceptron's training. The code reader is fitted in closed form."""
         return self.settings.fit
 
     def _fit_reader(

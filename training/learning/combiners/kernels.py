@@ -133,7 +133,6 @@ def _joined(patches: Sequence[Patch], coordinates: int, rank: int) -> dict[str, 
 
 
 def _padded(parts: Sequence[Tensor], value: float = 0) -> Tensor:
-    """Stack P tensors (·, …) to (P, longest, …)."""
     return nn.utils.rnn.pad_sequence(list(parts), batch_first=True, padding_value=value)
 
 

@@ -32,7 +32,6 @@ class ProductCorrection(Correction):
     def fit(
         cls, settings: ProductSettings, reference: TriangleMesh, own: JointSamples, held_out: JointSamples, seed: int
     ) -> ProductCorrection:
-        """Fit axes and weights to samples; see `Correction`."""
         y, others = own.inputs, held_out.inputs
         residual, wanted = (s.scaling.down(s.joint) - x.sum(dim=1) for s, x in ((own, y), (held_out, others)))
         centre = y.mean(dim=0)
