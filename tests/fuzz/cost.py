@@ -447,10 +447,6 @@ def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[CostTria
             trial.server.kill()
 
 
-#: All measurements of this run.
-COSTS: list[Cost] = []
-
-
 def summary(costs: Sequence[Cost], most: int = 20) -> str:
     """The number of requests over a budget, and a Markdown table of the most expensive ones."""
     rows = [

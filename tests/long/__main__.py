@@ -91,7 +91,7 @@ TESTS = {
     "costs": LongTest(
         "send EXAMPLES requests generated to be expensive; each has a budget of processor time and memory",
         ("service", "shapespace/files", "shapespace/model"),
-        (f"env FUZZ_EXAMPLES={{EXAMPLES}} {WHOLE} tests/fuzz/test_cost.py",),
+        ("python -m tests.fuzz --examples {EXAMPLES} --limits",),
         {"EXAMPLES": "2000"},
     ),
     "fuzz-api": LongTest(
