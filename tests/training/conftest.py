@@ -76,19 +76,77 @@ licence = "MIT"
 STEPS = 4
 
 
+def small_config(
+    name: str,
+    data: str,
+    *,
+    vertices: int,
+    modes: int,
+    log_steps: int,
+    samples: int,
+    part_size: int,
+    epochs: int,
+    correction: str = 'kind = "kernel"',
+    evaluation: str = "reconstructions = 2",
+    skip_degree: int = 2,
+) -> str:
+    """The configuration of a run on meshes that takes seconds; monolithic networks are fitted as factors are."""
+    fit = f"fit = {{ batch_size = 16, max_epochs = {epochs} }}"
+    return f"""
+[collection]
+data = "{data}"
+coarse_vertices = {vertices}
+
+[modes]
+count = {modes}
+log_steps = {log_steps}
+
+[factors]
+count = 2
+
+[samples]
+count = {samples}
+steps = {log_steps}
+part_size = {part_size}
+
+[networks.factors]
+hidden = [16]
+skip_degree = {skip_degree}
+{fit}
+
+[networks.combiner]
+correction = {{ {correction} }}
+
+[monolithic]
+hidden = [16]
+{fit}
+
+[monolithic_paper]
+hidden = [16]
+{fit}
+
+[evaluation]
+{evaluation}
+
+[export]
+name = "{name}"
+title = "{name.capitalize()}"
+description = "A run for the tests."
+licence = "MIT"
+"""
+
+
 def command(config: Path, out: Path, *more: str) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "shapespace.training",
-        "run",
-        str(config),
-        "--out",
-        str(out),
-        "--models",
-        str(out / "models"),
-        *more,
-    ]
+    """The command that trains, with its bundles beside its results."""
+    places = ["--out", str(out), "--models", str(out / "models")]
+    return [sys.executable, "-m", "shapespace.training", "run", str(config), *places, *more]
+
+
+def train(config: Path, out: Path, *more: str) -> str:
+    """Run the command until it has succeeded, and return what it wrote on standard output."""
+    done = subprocess.run(command(config, out, *more), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture(autouse=True)
@@ -111,9 +169,7 @@ def shared_run(factory: pytest.TempPathFactory, name: str, write: Callable[[Path
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.exists():
             folder.mkdir()
-            done = subprocess.run(command(write(folder), folder / "run"), capture_output=True, text=True, check=False)
-            assert done.returncode == 0, done.stderr
-            (folder / "said.txt").write_text(done.stdout)
+            (folder / "said.txt").write_text(train(write(folder), folder / "run"))
     return folder / "run"
 
 
