@@ -155,6 +155,32 @@ def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
 
 
+class Said:
+    """Runs ``shapespace-train`` in this process, which saves importing its libraries again; returns its output.
+
+    Attributes:
+        errors: what the last one wrote to standard error.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys, self.errors = monkeypatch, capsys, ""
+
+    def __call__(self, *arguments: str | Path, code: int = 0) -> str:
+        from shapespace.training.__main__ import main  # not needed by processes that only import this file
+
+        self._monkeypatch.setattr(sys, "argv", ["shapespace-train", *map(str, arguments)])
+        assert main() == code
+        captured = self._capsys.readouterr()
+        self.errors = captured.err
+        assert "Traceback" not in captured.err
+        return captured.out + captured.err
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
+    return Said(monkeypatch, capsys)
+
+
 def shared_run(factory: pytest.TempPathFactory, name: str, write: Callable[[Path], Path]) -> Path:
     """A run of the real command that all processes of a test session share.
 

@@ -19,13 +19,13 @@ import pytest
 from PIL import Image
 
 from shapespace.mesh.triangle_mesh import TriangleMesh, vertex_normals
-from shapespace.training.__main__ import main
 from shapespace.training.report.number_format import duration
 from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.report.rendering import Camera
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
+from tests.training.conftest import Said
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"nearness", "shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
@@ -369,22 +369,15 @@ def test_a_broken_file_is_named_in_one_line(tmp_path: Path, name: str, content: 
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_no_run_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", "report", str(tmp_path)])
-    assert main() == 1
-    assert capsys.readouterr().err == f"shapespace-train: {tmp_path} is no run directory: it holds no config.toml\n"
+def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path, said: Said) -> None:
+    words = said("report", tmp_path, code=1)
+    assert words == said.errors == f"shapespace-train: {tmp_path} is no run directory: it holds no config.toml\n"
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_says_where_the_page_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_where_the_page_is(tmp_path: Path, said: Said) -> None:
     (tmp_path / "config.toml").write_text(CONFIG)
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", "report", str(tmp_path)])
-    assert main() == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'report.html'}\n"
+    assert said("report", tmp_path) == f"{tmp_path / 'report.html'}\n"
 
 
 def test_the_report_needs_no_torch(tmp_path: Path) -> None:
