@@ -117,11 +117,7 @@ TESTS = {
             "coverage report --include 'shapespace/service/*' --fail-under 90",
         ),
     ),
-    "page": LongTest(
-        "the slow tests of the page in Chromium",
-        ("service/page",),
-        (f"{MARKED} tests/page",),
-    ),
+    "page": LongTest("the slow tests of the page in Chromium", ("service/page",), (f"{MARKED} tests/page",)),
     "firefox": LongTest(
         "try the page in Firefox, by WebDriver BiDi (Debian: firefox-esr, xvfb, libegl1 and libgl1-mesa-dri)",
         ("service/page",),

@@ -22,11 +22,7 @@ DIGEST = re.compile(r"[a-z0-9./-]+:[\w.-]+@sha256:[0-9a-f]{64}")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 #: Extras in each locked file. Torch is not locked: its builds, and so their hashes, differ between indexes.
-LOCKED = {
-    "serve": {"serve"},
-    "dev": EXTRAS.keys(),
-    "lowest": {"serve", "client", "usd", "check", "dev"},
-}
+LOCKED = {"serve": {"serve"}, "dev": EXTRAS.keys(), "lowest": {"serve", "client", "usd", "check", "dev"}}
 UNLOCKED = {"torch", PROJECT["project"]["name"]}
 
 

@@ -14,11 +14,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import BusyError, Caller, Workers
 from shapespace.service.use_cases import batch, many_shapes
-from shapespace.service.use_cases.batch import (
-    EncodedFile,
-    PiecewiseFile,
-    TooManyCodesError,
-)
+from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, TooManyCodesError
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.one_shape import ShapeRequest, shape_file
 from tests.service.bundles import write_bundle
