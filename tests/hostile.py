@@ -13,7 +13,8 @@ import zipfile
 from collections.abc import Callable
 
 import numpy as np
-from PIL import Image
+
+from tests.surfaces import png_of
 
 MIB = 2**20
 #: Largest upload, in bytes.
@@ -341,11 +342,10 @@ HOSTILE |= {f"glb_of_{member}": lengthy(member) for member in SKIPPED}
 @hostile
 def gltf_with_a_picture(size: int) -> tuple[str, bytes]:
     """A picture of half a gigapixel that is compressed to kilobytes."""
-    picture = io.BytesIO()
-    Image.new("1", (20_000, 20_000)).save(picture, "PNG")
+    picture = png_of(20_000, 1, 0, bytes(20_000 * 2_501))
     return "gltf", embedded(
         BINARY,
-        images=[{"uri": "data:image/png;base64," + base64.b64encode(picture.getvalue()).decode()}] * 20,
+        images=[{"uri": "data:image/png;base64," + base64.b64encode(picture).decode()}] * 20,
         textures=[{"source": 0}],
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
         meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,7 @@ import httpx
 import numpy as np
 
 from tests.faults.catalogue import FaultTarget, fault
-from tests.faults.serving import Steady, peak_memory
-from tests.service import hostile
-from tests.service.truth import Truth, bad_calls, good_calls
+from tests.faults.serving import Steady
 from tests.service.watching import eventually
 
 #: Number of bundles damaged at the same time.
@@ -134,44 +131,6 @@ def lie(target: FaultTarget, rng: np.random.Generator) -> str:
 
     require_refusals(target.steady, spoil)
     return f"all {BATCH} at a time refused, a line each; the others served as before"
-
-
-HARMS: dict[str, Callable[[Path, np.random.Generator], None]] = {
-    "loops": lambda folder, rng: hostile.loops(folder, nest=str(rng.choice(["", "if", "scan"]))),
-    "loops at its bounds": lambda folder, rng: hostile.loops(folder, beyond=rng.uniform(0, 0.19)),
-    "fails": lambda folder, rng: hostile.fails(folder, beyond=rng.uniform(-1, 0.19)),
-    "allocates": lambda folder, rng: hostile.allocates(folder, gigabytes=float(10 ** rng.uniform(0, 3))),
-    "changes shape": lambda folder, rng: hostile.changes_shape(folder, beyond=rng.uniform(-1, 0.19)),
-    "is not finite": lambda folder, rng: hostile.not_finite(folder, beyond=rng.uniform(-1, -0.01)),
-    "has no codes": lambda folder, rng: hostile.no_codes(folder),
-    "unpacks": lambda folder, rng: hostile.unpacks(folder, int(10 ** rng.uniform(7.5, 9))),
-}
-
-
-@fault("bundles that are what they say loop, fail or take memory when they are loaded or run")
-def harm(target: FaultTarget, rng: np.random.Generator) -> str:
-    assert len(HARMS) == BATCH
-    require_refusals(target.steady, lambda folder, k: list(HARMS.values())[k](folder, rng))
-    assert peak_memory(target.steady.server) < 300 * 2**20
-    return f"all {BATCH} at a time refused, a line each; the others served as before, in less than 300 MiB"
-
-
-@fault("a network hangs at some codes, and eight clients ask for them")
-def hangs(target: FaultTarget, rng: np.random.Generator) -> str:
-    models = target.folder / "models"
-    shutil.copytree(target.steady.models, models)
-    nest = str(rng.choice(["", "if", "scan"]))
-    hostile.hostile(models, "hangs", hostile.loops, beyond=hostile.BEYOND, nest=nest)
-    server = target.start(models, workers=2)
-    code = {"latents": [[rng.uniform(0.4, 1), 0.7, 0.4]]}
-    with httpx.Client(base_url=server.url, timeout=120) as client, ThreadPoolExecutor(8) as others:
-        truth = Truth(client, good_calls(client, "small", rng, 1) + bad_calls("small"))
-        asked = [others.submit(client.post, "/v1/models/hangs/vertices", json=code) for _ in range(8)]
-        assert truth.differing() == []
-        assert {future.result().status_code for future in asked} == {503}
-        assert truth.differing() == []
-    assert "Traceback" not in server.log
-    return "503 to them, each after 5 s or less; the others answered meanwhile, as before"
 
 
 #: Names that lead out of a folder, or somewhere else on some system.

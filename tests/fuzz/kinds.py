@@ -347,17 +347,6 @@ def every_vertex(rng: Rng, world: World) -> Request:
     return post(f"/v1/models/{model.name}/edit", json.dumps(body).encode())
 
 
-@kind("edit with targets far away")
-def far_targets(rng: Rng, world: World) -> Request:
-    model = world.quick(rng)
-    scale = 10.0 ** rng.uniform(-300, 300)
-    targets = [
-        {"vertex": k, "position": (rng.normal(size=3) * scale).tolist()} for k in range(int(rng.integers(1, 50)))
-    ]
-    body = {"latent": model.code(rng), "targets": targets, "prior": float(10.0 ** rng.uniform(-300, 300))}
-    return post(f"/v1/models/{model.name}/edit", json.dumps(body).encode())
-
-
 @kind("infer with as many codes as may be", limit=True)
 def many_codes_inferred(rng: Rng, world: World) -> Request:
     model = world.any(rng)
@@ -406,25 +395,19 @@ def odd_parts(rng: Rng, world: World) -> Request:
     return post(target, text + bytes(int(10 ** rng.uniform(0, 6))), {"Inference-Header-Content-Length": length})
 
 
-def many_vertices(format: str, exact: bool) -> Make:
+def all_allowed(name: str, call: str, **more: Any) -> None:
+    """Add a kind: a call that takes codes, with as many as may be."""
+
+    @kind(f"{name} of as many codes as may be", limit=True)
     def make(rng: Rng, world: World) -> Request:
         model = world.any(rng)
-        body = {"latents": model.codes(rng, 256), "exact": exact}
-        return post(f"/v1/models/{model.name}/vertices?format={format}", json.dumps(body).encode())
-
-    return make
+        return post(f"/v1/models/{model.name}/{call}", json.dumps({"latents": model.codes(rng, 256), **more}).encode())
 
 
 for _format in ("json", "npz"):
-    kind(f"vertices of as many codes as may be, as {_format}", limit=True)(many_vertices(_format, exact=False))
-    kind(f"exact vertices of as many codes as may be, as {_format}", limit=True)(many_vertices(_format, exact=True))
-
-
-@kind("nric of as many codes as may be", limit=True)
-def many_nric(rng: Rng, world: World) -> Request:
-    model = world.any(rng)
-    body = {"latents": model.codes(rng, 256), "factors": True}
-    return post(f"/v1/models/{model.name}/nric", json.dumps(body).encode())
+    all_allowed(f"vertices, as {_format},", f"vertices?format={_format}")
+    all_allowed(f"exact vertices, as {_format},", f"vertices?format={_format}", exact=True)
+all_allowed("nric", "nric", factors=True)
 
 
 @kind("sample as many codes as may be")
@@ -444,23 +427,6 @@ def many_keyframes(rng: Rng, world: World) -> Request:
         body["times"] = list(range(count))
     keyframes = b"[" + b",".join(codes[k % len(codes)] for k in range(count)) + b"]"
     return post(f"/v1/models/{model.name}/interpolations", spliced(body, "keyframes", keyframes))
-
-
-@kind("interpolation with numbers at their limits")
-def extreme_path(rng: Rng, world: World) -> Request:
-    """A path with extreme numbers; where the server would not issue an id for it, with a forged one."""
-    model = world.quick(rng)
-
-    def number() -> float:
-        return float(pick(rng, 0.0, 1.0, 1e308, -1e308, 5e-324, 1e-300, 1e38, 3.5e38, 1 / 3, -1e-9))
-
-    times = sorted({number(), number(), number()})
-    keyframes = [[number() for _ in range(model.dimension)] if rng.random() < 0.5 else model.code(rng) for _ in times]
-    body = {"keyframes": keyframes, "times": times, "frames": 3, "start": number(), "stop": number(), "loop": False}
-    if rng.random() < 0.5:
-        return post(f"/v1/models/{model.name}/interpolations", json.dumps(body).encode())
-    body |= {"mesh": "fine", "model": model.card["digest"][:32], "loop": bool(rng.random() < 0.5)}
-    return get(f"/v1/interpolations/{forged(json.dumps(body).encode())}{pick(rng, '/frames/0', '', '?format=jsonl')}")
 
 
 # Forged ids of interpolations.
@@ -497,18 +463,6 @@ def forged_id(rng: Rng, world: World) -> Request:
     return get(target + pick(rng, "", "/frames/0", "?format=jsonl", "?format=npz"))
 
 
-@kind("animation with a forged id that holds keyframes by the ten thousand")
-def forged_keyframes(rng: Rng, world: World) -> Request:
-    model = world.quick(rng)
-    count = int(10 ** rng.uniform(2, 6)) // (3 * model.dimension)
-    keyframes = [[0] * model.dimension] * max(2, count)
-    facts: dict[str, Any] = {"frames": 600, "keyframes": keyframes, "model": model.card["digest"][:32]}
-    if rng.random() < 0.5:
-        facts["times"] = list(range(len(keyframes)))
-    text = json.dumps(facts, separators=(",", ":")).encode()
-    return get(f"/v1/interpolations/{forged(text)}/frames/{pick(rng, 0, 599)}")
-
-
 def link(model: Model, frames: int, codes: list[list[float]], mesh: str = "fine") -> str:
     """The address of an animation."""
     facts = {
@@ -542,13 +496,6 @@ def a_mesh(rng: Rng, world: World) -> Request:
     if rng.random() < 0.5:
         query += f"&color={pick(rng, 'stretch', 'bending')}&against={','.join(map(str, model.code(rng)))}"
     return get(f"/v1/models/{model.name}/mesh?{query}")
-
-
-@kind("mesh far outside the bounds")
-def far_mesh(rng: Rng, world: World) -> Request:
-    model = world.any(rng)
-    code = (rng.normal(size=model.dimension) * 10 ** rng.uniform(0, 39)).tolist()
-    return get(f"/v1/models/{model.name}/mesh?latent={','.join(map(str, code))}&mesh=coarse")
 
 
 # Heads.
@@ -885,40 +832,15 @@ def byte_by_byte(rng: Rng, world: World) -> Request:
     return Request(part for k in range(len(whole)) for part in (whole[k : k + 1], 0.001))
 
 
-@kind("half a head, and the end")
-def half_a_head(rng: Rng, world: World) -> Request:
-    whole = head("GET", a_get(world, rng), {"Accept": "a" * int(10 ** rng.uniform(1, 4))})
-    return Request([whole[: int(rng.integers(1, len(whole)))]], broken=True, half_closed=True)
-
-
-@kind("half a body, and the end")
-def half_a_body(rng: Rng, world: World) -> Request:
+@kind("a request, or a part of it, and the end")
+def cut_short(rng: Rng, world: World) -> Request:
+    """The server treats the end of one direction as that of the connection."""
     target, body = a_call(world, rng)
     content = json.dumps(body).encode().ljust(int(10 ** rng.uniform(2, 6)))
-    start = head("POST", target, {**JSON_TYPE, "Content-Length": str(len(content))})
-    return Request([start, content[: int(rng.integers(len(content)))]], broken=True, half_closed=True)
-
-
-@kind("a whole request, and the end")
-def half_closed(rng: Rng, world: World) -> Request:
-    target, body = a_call(world, rng)
-    # The server treats the end of one direction as that of the connection.
-    return Request(post(target, json.dumps(body).encode()).parts, broken=True, half_closed=True)
-
-
-@kind("a head that never ends", long=True)
-def slow_head(rng: Rng, world: World) -> Request:
-    whole = head("GET", a_get(world, rng), {"Accept": "a" * 3000})
-    drip = (part for k in range(len(whole) - 10) for part in (whole[k : k + 1], 0.05))
-    return Request(pick(rng, drip, [whole[:100]], []), broken=True)
-
-
-@kind("a body that never ends", long=True)
-def slow_body(rng: Rng, world: World) -> Request:
-    target, _ = a_call(world, rng)
-    start = head("POST", target, {**JSON_TYPE, "Content-Length": "1000"})
-    drip = (part for _ in range(900) for part in (b" ", 0.05))
-    return Request(pick(rng, [start], (part for parts in ([start], drip) for part in parts)))
+    start = head("POST", target, {**JSON_TYPE, "Content-Length": str(len(content)), "Accept": "a" * 1000})
+    whole = start + content
+    part = pick(rng, whole, whole[: int(rng.integers(1, len(whole)))], start[: int(rng.integers(1, len(start)))])
+    return Request([part], broken=True, half_closed=True)
 
 
 @kind("not HTTP at all")
