@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, sync_playwright
 from shapespace.files.reading import read_arrays
 from tests.page.studio import OpenPage
 from tests.service.bundles import write_bundle
-from tests.service.conftest import ROOT, Server, Start, starting
+from tests.service.conftest import ROOT, Server, start, starting  # noqa: F401 - a fixture
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 #: WebGL in software, which works on every machine.
@@ -40,13 +40,6 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(models: Path) -> Iterator[Server]:
     with starting() as start:
         yield start(models, workers=2, deadline=300)
-
-
-@pytest.fixture
-def start() -> Iterator[Start]:
-    """Start servers that end with the test."""
-    with starting() as start:
-        yield start
 
 
 @pytest.fixture(scope="module")

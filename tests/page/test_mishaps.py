@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from tests.page.conftest import CHROMIUM, Open
 from tests.page.studio import OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
+from tests.service.watching import free_port
 
 
 def without(studio: OpenPage) -> None:
@@ -62,9 +62,7 @@ def test_nothing_can_be_pressed_before_the_model_is_there(window: Open) -> None:
 
 
 def test_the_picker_and_download_while_the_server_is_away_and_after(window: Open, start: Start, models: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     server = start(models, port=port)
     studio = window(server.url, complains=True).open()
     server.stop()
