@@ -38,8 +38,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def server(models: Path) -> Iterator[Server]:
-    with starting() as start:
-        yield start(models, workers=2, deadline=300)
+    with starting() as begin:
+        yield begin(models, workers=2, deadline=300)
 
 
 @pytest.fixture(scope="module")
