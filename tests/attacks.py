@@ -4,8 +4,6 @@ Each attack lasts some seconds, from a few clients at once, while another client
 ordinary shapes. This module needs only httpx. Use it on servers of your own only.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

@@ -3,8 +3,6 @@
 Bodies are generated on demand, each with the format that it is sent as.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json

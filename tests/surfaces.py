@@ -1,7 +1,5 @@
 """A ball of triangles and quads with texture, materials and names; OBJ files of it, not by our writers."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

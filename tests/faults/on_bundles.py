@@ -1,7 +1,5 @@
 """Bundles that don't agree with their manifests are refused with one line each; others are not affected."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Faults of the server's machine: signals under load, a clock that jumps, a full or read-only disk."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """Requests that ask for too much: refused at once, without allocating the memory that they need."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket

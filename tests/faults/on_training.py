@@ -1,7 +1,5 @@
 """Faults of a training machine: the same command continues the run and ends with the same bits."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Small runs of the training command: one without faults, and others that must end with the same files."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

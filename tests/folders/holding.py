@@ -1,7 +1,5 @@
 """Run the command on a folder, and check messages, exit code and the shapes of the bundle."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Sends requests generated to be expensive, one after the other, and prints the mo
 of processor time, so the machine should have little else to do.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

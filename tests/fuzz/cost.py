@@ -1,7 +1,5 @@
 """What one request costs a server: time on its event loop, memory, and time until the answer."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

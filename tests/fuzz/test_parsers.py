@@ -3,8 +3,6 @@
 The suite uses a few hundred examples, always the same; ``make long fuzz`` thousands of new ones.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -5,8 +5,6 @@ passed. The record is a table in docs/measurements/reliability.md; commit that p
 ``ARGS``, which may select a part, is not recorded.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """One server for all tests of the page, a browser for each file of tests, and a new window for each test."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Codes from the server: of a file, and random ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import httpx

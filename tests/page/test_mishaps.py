@@ -1,7 +1,5 @@
 """The page with missing browser features, failing servers and unusual user input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

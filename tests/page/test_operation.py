@@ -1,7 +1,5 @@
 """The page as a whole: models, errors, a server that stops and starts, accessibility, download size."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pulls at the surface, which leave pins: what follows, what stays, and the page's messages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Observing a server from outside: waiting for a condition, and reading metrics."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ was wrong, an attack affected other clients, health took longer than a second, o
 handles grew.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

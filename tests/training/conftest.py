@@ -1,7 +1,5 @@
 """A small run of the real command, whose files several tests read, and small collections."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import subprocess

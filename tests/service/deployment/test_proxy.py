@@ -1,7 +1,5 @@
 """The committed nginx configuration in a real nginx, in front of real replicas."""
 
-from __future__ import annotations
-
 import http.server
 import itertools
 import json

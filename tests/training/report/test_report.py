@@ -1,7 +1,5 @@
 """The report of an artificial run: what it shows, what it omits, and that its pictures aren't empty."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Samples computed by real processes that are killed, without and with a local Dask cluster."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Modes of an ellipsoid with three bumps that move independently of each other."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import get_args
 

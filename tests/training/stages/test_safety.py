@@ -1,7 +1,5 @@
 """What a run never does: write into other folders, read devices, end for good at a damaged file, or leave processes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A collection of textured bars in several parts, and one run of the real command on it."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The bundled models are those that their committed runs exported."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tomllib
