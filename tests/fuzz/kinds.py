@@ -144,8 +144,8 @@ def get(target: str, headers: Iterable[tuple[str, str]] | dict[str, str] = ()) -
     return Request([head("GET", target, headers)])
 
 
-def post(target: str, body: bytes, headers: dict[str, str] = JSON_TYPE, *, wrong: bool = False) -> Request:
-    return Request([head("POST", target, {**headers, "Content-Length": str(len(body))}), body], wrong=wrong)
+def post(target: str, body: bytes, headers: dict[str, str] = JSON_TYPE) -> Request:
+    return Request([head("POST", target, {**headers, "Content-Length": str(len(body))}), body])
 
 
 def size(rng: Rng, most: int = BODY) -> int:
