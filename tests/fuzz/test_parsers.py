@@ -208,7 +208,7 @@ def test_uploads(format: str) -> None:
     def upload(data: bytes) -> None:
         try:
             with at_most(1000 + 10 * len(data), MEMORY):
-                vertices, faces, *_ = read_mesh_file(data, "", format, limits(model().decoder))
+                ((vertices, faces, _),), _ = read_mesh_files(data, "", format, SMALL)
             found = match(model().decoder, vertices, faces)
         except (UploadError, InvalidMeshError) as error:
             one_line(error)
