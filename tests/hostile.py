@@ -3,8 +3,6 @@
 Bodies are generated on demand, each with the format that it is sent as.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -14,6 +12,8 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
+
+from tests.surfaces import png_of
 
 MIB = 2**20
 #: Largest upload, in bytes.
@@ -80,7 +80,9 @@ HOSTILE |= {
         ply_head("ascii", "element vertex 1", *XYZ, "element face 65000", *PROPERTIES, INDICES) + b"0 0 0\n",
         b"0 " * len(PROPERTIES) + b"3 0 0 0\n",
     ),
+    "ply_of_elements": repeating("ply", b"ply\nformat ascii 1.0\n", b"element vertex 0\nproperty list uint int x\n"),
     "ply_without_end": repeating("ply", b"ply\nformat ascii 1.0\n", b"comment x\n"),
+    "glb_that_boasts": repeating("glb", struct.pack("<4sIII4s", b"glTF", 2, 2**32 - 1, 2**31, b"JSON"), b" "),
     "stl_of_text": repeating("stl", b"solid\n", b"vertex 0 0 0\n", b"endsolid\n"),
     "stl_of_solids": repeating("stl", b"", b"solid\nendsolid\n"),
     "stl_of_one_line": repeating("stl", b"solid", b" vertex 0 0 0"),
@@ -94,6 +96,13 @@ HOSTILE |= {
     "gltf_of_escapes": repeating("gltf", b'{"buffers": [{"uri": "data:;base64,\\/', b"A", b'"}]}'),
     "gltf_of_spaces": repeating("gltf", b"{", b" ", b"}"),
     "form_of_parts": repeating(FORM, b"", b'--b\r\nContent-Disposition: form-data; name="a"\r\n\r\n\r\n', b"--b--\r\n"),
+    "form_of_boundaries": repeating(FORM, b"", b"--b\r\n"),
+    "form_of_returns": repeating(FORM, A_FILE, b"\r"),
+    "form_in_a_form": repeating(
+        FORM, A_FILE[:-2] + b"Content-Type: multipart/mixed; boundary=c\r\n\r\n", b"--c\r\n\r\n"
+    ),
+    "form_with_a_long_name": repeating(FORM, b'--b\r\nContent-Disposition: form-data; name="', b"a"),
+    "form_of_quotes": repeating(FORM, b"--b\r\nContent-Disposition: form-data; name=", b'"\\"'),
     "form_of_almost_boundaries": repeating(FORM, A_FILE, b"\r\n--bX"),
     "form_of_line_ends": repeating(FORM, A_FILE, b"\r\n-"),
     "form_of_headers": repeating(FORM, b"--b\r\n", b"a: b\r\n"),
@@ -195,11 +204,17 @@ def stl_that_boasts(size: int) -> tuple[str, bytes]:
 
 
 def archive(
-    members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED, patch: tuple[int, int, str] | None = None
+    members: dict[str, bytes],
+    method: int = zipfile.ZIP_DEFLATED,
+    patch: tuple[int, int, str] | None = None,
+    before: bytes = b"",
 ) -> bytes:
-    """An archive; ``patch`` (offset, value, struct type) changes a field in all entries of its directory."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", method, compresslevel=1) as file:
+    """An archive; ``patch`` (offset, value, struct type) changes a field in all entries of its directory.
+
+    The members are added to the archive ``before``.
+    """
+    buffer = io.BytesIO(before)
+    with zipfile.ZipFile(buffer, "a", method, compresslevel=1) as file:
         for name, content in members.items():
             file.writestr(name, content)
     data = bytearray(buffer.getvalue())
@@ -212,7 +227,7 @@ def archive(
 
 def npy(shape: str, data: bytes = b"", kind: str = "<f8") -> bytes:
     text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+    return b"\x93NUMPY\x02\x00" + struct.pack("<I", len(text)) + text + data
 
 
 ZEROS = npy("(2796202, 3)", bytes(64 * MIB))
@@ -236,6 +251,11 @@ HOSTILE |= {
         "npz",
         twice(b"\x93NUMPY\x02\x00" + struct.pack("<I", 96 * MIB) + bytes(96 * MIB)),
     ),
+    "npz_of_many_dimensions": lambda _: ("npz", twice(npy("(" + "1," * 100_000 + ")"))),
+    "npz_of_nested_dimensions": lambda _: ("npz", twice(npy("(" * 5000 + ")" * 5000))),
+    "npz_of_no_values": lambda _: ("npz", twice(npy(f"({10**8}, 0, 3)"))),
+    "npz_of_objects": lambda _: ("npz", twice(npy("(1000, 3)", bytes(24_000), "|O"))),
+    "npz_with_a_long_name": lambda _: ("npz", archive({"a" * 60_000: b"", "vertices.npy": npy("(8, 3)", bytes(192))})),
     # LZMA allocates as much memory as its header declares.
     "npz_by_another_method": lambda _: ("npz", twice(npy("(10922, 3)", bytes(MIB // 4)), zipfile.ZIP_LZMA)),
 }
@@ -290,6 +310,45 @@ def glb_of_many_places(size: int) -> tuple[str, bytes]:
 @hostile
 def glb_of_long_chain(size: int) -> tuple[str, bytes]:
     return "glb", chain(9_990)
+
+
+@hostile
+def glb_of_meshes_along_a_chain(size: int) -> tuple[str, bytes]:
+    nodes = [{"matrix": MATRIX, "mesh": 0, "children": [k + 1]} for k in range(9_990)]
+    return "glb", glb(document(nodes=[*nodes, {"mesh": 0}]), BINARY)
+
+
+@hostile
+def glb_of_one_name(size: int) -> tuple[str, bytes]:
+    nodes = [{"name": "x", "mesh": 0} for _ in range(9_990)]
+    return "glb", glb(document(nodes=nodes, scenes=[{"nodes": list(range(len(nodes)))}]), BINARY)
+
+
+#: Members of a glTF document that a reader of surfaces may skip, by what they list.
+SKIPPED: dict[str, object] = {
+    "skins": {"joints": [0]}, "animations": {"channels": [{}]}, "materials": {}, "textures": {}, "cameras": {},
+    "images": {"uri": "data:image/png;base64,AAAA"}, "extensionsUsed": "x",
+}  # fmt: skip
+
+
+def lengthy(member: str) -> Make:
+    return lambda size: ("glb", glb(document(**{member: [SKIPPED[member]] * 30_000}), BINARY))
+
+
+HOSTILE |= {f"glb_of_{member}": lengthy(member) for member in SKIPPED}
+
+
+@hostile
+def gltf_with_a_picture(size: int) -> tuple[str, bytes]:
+    """A picture of half a gigapixel that is compressed to kilobytes."""
+    picture = png_of(20_000, 1, 0, bytes(20_000 * 2_501))
+    return "gltf", embedded(
+        BINARY,
+        images=[{"uri": "data:image/png;base64," + base64.b64encode(picture).decode()}] * 20,
+        textures=[{"source": 0}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+    )
 
 
 @hostile

@@ -1,7 +1,5 @@
 """Reading mesh files as checked meshes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from shapespace.files.reading import read_arrays

@@ -1,7 +1,5 @@
 """Reading sequences of shapes by their specifications, independently of the code that wrote them."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A ball of triangles and quads with texture, materials and names; OBJ files of it, not by our writers."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path
@@ -14,15 +12,19 @@ from shapespace.mesh.attributes import Labels, MeshAttributes, SurfaceMaterial
 
 def png(seed: int = 0, size: int = 4, color: tuple[int, int, int] | None = None) -> bytes:
     """A PNG picture of a few pixels, of one colour or of random ones."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
     pixels = np.random.default_rng(seed).integers(0, 256, (size, size, 3), np.uint8)
     if color:
         pixels[:] = color
-    rows = b"".join(b"\0" + row.tobytes() for row in pixels)
-    head = struct.pack(">IIBBBBB", size, size, 8, 2, 0, 0, 0)
+    return png_of(size, 8, 2, b"".join(b"\0" + row.tobytes() for row in pixels))
+
+
+def png_of(size: int, bits: int, kind: int, rows: bytes) -> bytes:
+    """A square PNG picture of rows with a filter byte each; ``kind`` is PNG's colour type."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = struct.pack(">IIBBBBB", size, size, bits, kind, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 

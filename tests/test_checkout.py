@@ -1,7 +1,5 @@
 """A checkout without symbolic links, as git makes it on Windows by default, says so."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

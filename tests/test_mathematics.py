@@ -16,10 +16,7 @@ def test_every_function_of_the_page_exists() -> None:
 
 
 #: Packages with numerical modules.
-ROOMS = {
-    "shapespace": ("solve", "coordinates", "mesh", "shell", "model"),
-    "training": ("space", "learning"),
-}
+ROOMS = {"shapespace": ("solve", "coordinates", "mesh", "shell", "model"), "training": ("space", "learning")}
 #: Modules in them that implement no formula: they store, name, choose, run or write.
 NO_MATHEMATICS = {
     "shapespace.solve.deadline",

@@ -1,7 +1,5 @@
 """The wheel: `shapespace` is its only top-level package, and it has all that serving the figure needs."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The files that other programs open, and the positions that they must find in them."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """All faults by name, and their outcomes: the table of docs/measurements/reliability.md."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter, defaultdict
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A system clock that jumps for one process and its children only."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Shared by all faults: a server to inject them into, and a training run without faults to compare with."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Clients that are slow or disconnect: they occupy a connection, and no other client waits for them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

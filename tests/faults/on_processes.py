@@ -1,7 +1,5 @@
 """Faults of the server's machine: signals under load, a clock that jumps, a full or read-only disk."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil
@@ -18,23 +16,8 @@ from tests.faults.catalogue import FaultTarget, fault
 from tests.faults.clock import YEAR, jumping_clock
 from tests.faults.on_training import read_only
 from tests.service.bundles import SCALE, rescale, write_bundle
-from tests.service.operation.test_draining import Load
 from tests.service.truth import Truth, fingerprint, good_calls
 from tests.service.watching import eventually
-
-
-@fault("the server is told to end (SIGTERM) under load")
-def terminated(target: FaultTarget, rng: np.random.Generator) -> str:
-    server = target.start(target.steady.models, workers=2, drain=rng.choice([0, 0.5]))
-    load = Load(server, 6)
-    enough = rng.integers(1, 100)
-    eventually(lambda: load.outcomes["answered"] >= enough)
-    server.process.send_signal(signal.SIGTERM)
-    load.wait()
-    assert set(load.outcomes) == {"answered", "refused"}, load.outcomes
-    assert server.process.wait(60) == 0
-    assert "Traceback" not in server.log
-    return "every accepted request answered, then status 0"
 
 
 class Askers:

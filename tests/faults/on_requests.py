@@ -1,7 +1,5 @@
 """Requests that ask for too much: refused at once, without allocating the memory that they need."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket
@@ -87,14 +85,8 @@ def bodies(number: str) -> list[RecordedCall]:
         post(f"{MODEL}/vertices", f'{{"latents": [{code}]}}'.encode()),
         post(f"{MODEL}/nric", f'{{"latents": [{code}], "factors": true}}'.encode()),
         post(f"{MODEL}/interpolations", f'{{"keyframes": [{code}, [0, 0, 0]], "frames": 3}}'.encode()),
-        post(
-            f"{MODEL}/interpolations",
-            f'{{{PATH}, "stop": {number}}}'.encode(),
-        ),
-        post(
-            f"{MODEL}/interpolations",
-            f'{{{PATH}, "times": [0, {number}]}}'.encode(),
-        ),
+        post(f"{MODEL}/interpolations", f'{{{PATH}, "stop": {number}}}'.encode()),
+        post(f"{MODEL}/interpolations", f'{{{PATH}, "times": [0, {number}]}}'.encode()),
         post(f"{MODEL}/edit", f'{{"latent": {code}, "targets": [{{"vertex": 0, "position": [0,0,0]}}]}}'.encode()),
         post(
             f"{MODEL}/edit",

@@ -1,7 +1,5 @@
 """A server into which faults are injected, and which must be in its former state afterwards."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

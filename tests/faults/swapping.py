@@ -1,7 +1,5 @@
 """Faults in a folder of models that changes under load."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -12,12 +12,11 @@ import pytest
 from tests.faults import on_bundles, on_clients, on_processes, on_requests, on_training  # noqa: F401
 from tests.faults.catalogue import FAULTS, OUTCOMES, SEEDS, FaultTarget
 
-#: One fault of each kind: of bundles, of requests, of clients and of processes.
+#: One fault of bundles, of requests and of clients.
 IN_SUITE = {
-    "the manifest lies about shapes, digests, sizes or names",
+    "files of a bundle are cut short, bits are flipped, or the manifest lies",
     "codes and positions are NaN, infinite, 1e30 or 1e308",
     "clients vanish while they send, wait or read",
-    "the server is told to end (SIGTERM) under load",
 }
 
 

@@ -1,7 +1,5 @@
 """Train on some fifty folders with one fault each: ``python -m tests.folders [PART OF A NAME]``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Folders with one fault each: the messages of a run, its exit code, and whether it exports a bundle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

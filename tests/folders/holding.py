@@ -1,7 +1,5 @@
 """Run the command on a folder, and check messages, exit code and the shapes of the bundle."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence
@@ -21,53 +19,10 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.training import __main__ as training
 from shapespace.training.collection.ingest import read_collection
 from tests.folders.catalogue import Folder
+from tests.training.conftest import small_config
 
 #: Largest numbers of codes to compute shapes of, and of training shapes to encode.
 CODES, ENCODED = 100, 10
-CONFIG = """
-[collection]
-data = "{data}"
-coarse_vertices = 250
-
-[modes]
-count = 4
-log_steps = 4
-max_iterations = 40
-
-[factors]
-count = 2
-
-[samples]
-count = 80
-steps = 4
-part_size = 20
-
-[networks.factors]
-hidden = [16]
-skip_degree = 3
-fit = {{ batch_size = 16, max_epochs = 10 }}
-
-[networks.combiner]
-correction = {{ kind = "kernel", coefficients = 6 }}
-
-[monolithic]
-hidden = [16]
-fit = {{ batch_size = 16, max_epochs = 2 }}
-
-[monolithic_paper]
-hidden = [16]
-fit = {{ batch_size = 16, max_epochs = 2 }}
-
-[evaluation]
-reconstructions = 4
-exact_factors = 4
-
-[export]
-name = "figure"
-title = "Figure"
-description = "A run for the tests."
-licence = "MIT"
-"""
 
 
 def command(arguments: Sequence[str]) -> tuple[int, str]:
@@ -90,7 +45,20 @@ def hold(folder: Folder, place: Path) -> str:
     assert code in (0, 1), first
     assert "Traceback" not in first, first
     config = place / "figure.toml"
-    config.write_text(CONFIG.format(data=data.name), encoding="utf-8")
+    text = small_config(
+        "figure",
+        data.name,
+        vertices=250,
+        modes=4,
+        log_steps=4,
+        samples=80,
+        part_size=20,
+        epochs=10,
+        correction='kind = "kernel", coefficients = 6',
+        evaluation="reconstructions = 4\nexact_factors = 4",
+        skip_degree=3,
+    )
+    config.write_text(text.replace("[factors]", "max_iterations = 40\n\n[factors]", 1), encoding="utf-8")
     run = ["run", str(config), "--out", str(place / "run"), "--models", str(place / "models"), *folder.arguments]
     if folder.later:
         code, words = command([*run, "--until", "ingest"])

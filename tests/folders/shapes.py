@@ -1,7 +1,5 @@
 """The bundled figure in a few poses, at several resolutions, and changes of meshes and files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Folders that end with a message before anything is computed; ``python -m tests.folders`` runs all."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What one request costs a server: time on its event loop, memory, and time until the answer."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -21,6 +19,7 @@ import httpx
 
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server
+from tests.service.watching import processes
 
 MIB = 2**20
 #: Budgets of a request: seconds of one callback of the event loop, and peak bytes in addition to those sent.
@@ -54,13 +53,11 @@ class Request:
         parts: what is sent, one after the other; a number is a pause in seconds.
         broken: whether it isn't valid HTTP, so that the connection may be closed without an answer.
         half_closed: whether the client closes its sending direction after the last byte.
-        wrong: whether it has to be refused.
     """
 
     parts: Iterable[bytes | float]
     broken: bool = False
     half_closed: bool = False
-    wrong: bool = False
 
 
 @dataclass
@@ -164,12 +161,7 @@ class Measured(Server):
     @property
     def pids(self) -> list[int]:
         """Ids of the server's process and its children, parents first."""
-        found = [self.process.pid]
-        for pid in found:
-            with contextlib.suppress(OSError):
-                for task in Path(f"/proc/{pid}/task").iterdir():
-                    found += map(int, (task / "children").read_text().split())
-        return found
+        return processes(self.process.pid)
 
     def computing(self) -> float:
         """Seconds of CPU time that the processes have taken so far."""
@@ -282,8 +274,6 @@ class Measured(Server):
         cost.statuses = [status for status in map(int, _STATUS.findall(bytes(answer))) if status >= 200]
         if not cost.faults and not cost.statuses and not request.broken:
             cost.faults.append("the connection was closed without an answer")
-        if request.wrong and not all(400 <= status < 500 for status in cost.statuses):
-            cost.faults.append("it was not refused")
         cost.faults += [f"status {status}" for status in cost.statuses if status >= 500 and status not in _BUSY]
 
 
@@ -445,10 +435,6 @@ def serving(deadline: float = DEADLINE, **settings: object) -> Iterator[CostTria
             yield trial
         finally:
             trial.server.kill()
-
-
-#: All measurements of this run.
-COSTS: list[Cost] = []
 
 
 def summary(costs: Sequence[Cost], most: int = 20) -> str:

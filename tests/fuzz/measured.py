@@ -5,8 +5,6 @@ connection: ``reset`` collects garbage, returns free memory to the system and re
 answers its values as JSON.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import json

@@ -5,8 +5,6 @@ passed. The record is a table in docs/measurements/reliability.md; commit that p
 ``ARGS``, which may select a part, is not recorded.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -91,7 +89,7 @@ TESTS = {
     "costs": LongTest(
         "send EXAMPLES requests generated to be expensive; each has a budget of processor time and memory",
         ("service", "shapespace/files", "shapespace/model"),
-        (f"env FUZZ_EXAMPLES={{EXAMPLES}} {WHOLE} tests/fuzz/test_cost.py",),
+        ("python -m tests.fuzz --examples {EXAMPLES} --limits",),
         {"EXAMPLES": "2000"},
     ),
     "fuzz-api": LongTest(
@@ -117,11 +115,7 @@ TESTS = {
             "coverage report --include 'shapespace/service/*' --fail-under 90",
         ),
     ),
-    "page": LongTest(
-        "the slow tests of the page in Chromium",
-        ("service/page",),
-        (f"{MARKED} tests/page",),
-    ),
+    "page": LongTest("the slow tests of the page in Chromium", ("service/page",), (f"{MARKED} tests/page",)),
     "firefox": LongTest(
         "try the page in Firefox, by WebDriver BiDi (Debian: firefox-esr, xvfb, libegl1 and libgl1-mesa-dri)",
         ("service/page",),

@@ -6,8 +6,6 @@ is run with the tests that cover its line, those of its own module first. The di
 in build/mutants.diff.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import os

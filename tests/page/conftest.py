@@ -1,7 +1,5 @@
 """One server for all tests of the page, a browser for each file of tests, and a new window for each test."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +13,7 @@ from playwright.sync_api import Browser, sync_playwright
 from shapespace.files.reading import read_arrays
 from tests.page.studio import OpenPage
 from tests.service.bundles import write_bundle
-from tests.service.conftest import ROOT, Server, Start, starting
+from tests.service.conftest import ROOT, Server, start, starting  # noqa: F401 - a fixture
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 #: WebGL in software, which works on every machine.
@@ -38,15 +36,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def server(models: Path) -> Iterator[Server]:
-    with starting() as start:
-        yield start(models, workers=2, deadline=300)
-
-
-@pytest.fixture
-def start() -> Iterator[Start]:
-    """Start servers that end with the test."""
-    with starting() as start:
-        yield start
+    with starting() as begin:
+        yield begin(models, workers=2, deadline=300)
 
 
 @pytest.fixture(scope="module")

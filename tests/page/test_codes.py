@@ -1,6 +1,4 @@
-"""Codes from the server: of a file, of a pull at a vertex, and random ones."""
-
-from __future__ import annotations
+"""Codes from the server: of a file, and random ones."""
 
 from pathlib import Path
 
@@ -68,50 +66,3 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     studio["#seed"].fill("1")
     studio["#seed"].press("Enter")
     studio.until_code([*first[:2], locked])
-
-
-def test_a_pull_keeps_what_is_locked(studio: OpenPage) -> None:
-    studio.coordinate(1).locator("[data-do=lock]").click()
-    sent = []
-    studio.page.on("request", lambda request: sent.append(request.post_data_json) if "/edit" in request.url else None)
-    studio["#pull"].click()
-    before = studio.picture()
-    box = studio["#canvas"].bounding_box()
-    assert box
-    inside = np.abs(before - before[0, 0]).max(axis=2) > 40
-    x = int(np.flatnonzero(inside.any(axis=0))[-1]) - 6
-    y = int(np.median(np.flatnonzero(inside[:, x])))
-    studio.page.mouse.move(box["x"] + x, box["y"] + 60 + y)
-    studio.page.mouse.down()
-    studio.page.mouse.move(box["x"] + x + 15, box["y"] + 60 + y, steps=3)
-    studio.page.wait_for_timeout(200)
-    studio.page.mouse.up()
-    studio.eventually(lambda: any(studio.code))
-    assert studio.code[1] == 0
-    assert sent[0]["fixed"] == {"1": 0}
-
-
-def test_pulling_at_a_vertex_takes_the_shape_along(studio: OpenPage) -> None:
-    studio["#pull"].click()
-    before = studio.picture()
-    box = studio["#canvas"].bounding_box()
-    assert box
-    # The rightmost point of the torus, in the picture.
-    inside = np.abs(before - before[0, 0]).max(axis=2) > 40
-    x = int(np.flatnonzero(inside.any(axis=0))[-1]) - 6
-    y = int(np.median(np.flatnonzero(inside[:, x])))
-    place = box["x"] + x, box["y"] + 60 + y
-    studio.page.mouse.move(*place)
-    studio.page.mouse.down()
-    studio.page.mouse.move(place[0] + 12, place[1], steps=3)
-    studio.page.mouse.move(place[0] + 18, place[1], steps=3)
-    studio.page.wait_for_timeout(200)
-    studio.page.mouse.up()
-    studio.eventually(lambda: any(abs(value) > 0.02 for value in studio.code))
-    studio["#theme"].hover()
-    studio.rest()
-    after = studio.until_different(before)
-    reach = int(np.flatnonzero((np.abs(after - after[0, 0]).max(axis=2) > 40).any(axis=0))[-1])
-    assert reach > x + 8, "the shape did not follow the pointer"
-    studio["#undo"].click()
-    studio.until_code([0, 0, 0])

@@ -1,7 +1,5 @@
 """Saving and opening meshes and codes on the page."""
 
-from __future__ import annotations
-
 import io
 import json
 import shlex

@@ -1,7 +1,5 @@
 """Size of the shape in windows of all sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

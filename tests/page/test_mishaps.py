@@ -1,20 +1,16 @@
 """The page with missing browser features, failing servers and unusual user input."""
 
-from __future__ import annotations
-
 import json
-import socket
 from pathlib import Path
 
-import httpx
 import pytest
 from playwright.sync_api import Browser, Route
 
-from shapespace.files.reading import READ_FORMATS, SCAN_FORMATS, read_arrays
 from tests.page.conftest import CHROMIUM, Open
 from tests.page.studio import OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
+from tests.service.watching import free_port
 
 
 def without(studio: OpenPage) -> None:
@@ -64,9 +60,7 @@ def test_nothing_can_be_pressed_before_the_model_is_there(window: Open) -> None:
 
 
 def test_the_picker_and_download_while_the_server_is_away_and_after(window: Open, start: Start, models: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     server = start(models, port=port)
     studio = window(server.url, complains=True).open()
     server.stop()
@@ -119,30 +113,6 @@ def test_numbers_are_not_cut(window: Open, width: int) -> None:
     assert box.evaluate("b => b.scrollWidth <= b.clientWidth")
     script = "b => { b.value = '-300000.1234'; return b.scrollWidth <= b.clientWidth; }"
     assert not box.evaluate(script), "the measurement must detect a number that is cut off"
-
-
-def test_every_kind_of_file_that_is_offered_is_read(studio: OpenPage, server: Server) -> None:
-    studio.tab("Files")
-    offered = (studio["#mesh-file"].get_attribute("accept") or "").replace(".", "").split(",")
-    call = f"{server.url}/v1/models/with-fine"
-    for name in offered:
-        path = "mesh?latent=0.1,0,0.5&mesh=coarse"
-        points = name in SCAN_FORMATS.keys() - READ_FORMATS.keys()
-        if points or name == "off":
-            vertices, faces = read_arrays(httpx.get(f"{call}/{path}&format=npz", timeout=60).content, "npz")
-        if points:
-            content = "\n".join(" ".join(map(str, x)) for x in vertices.tolist()).encode()
-            if name == "pcd":
-                head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {len(vertices)}\nHEIGHT 1\nDATA ascii\n"
-                content = head.encode() + content
-        elif name == "off":
-            lines = [f"OFF\n{len(vertices)} {len(faces)} 0", *(" ".join(map(str, x)) for x in vertices.tolist())]
-            content = "\n".join([*lines, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist()), ""]).encode()
-        else:
-            content = httpx.get(f"{call}/{path}&format={name}", timeout=60).content
-        call_of = "fit" if points else "encode"
-        found = httpx.post(f"{call}/{call_of}?format={name}", content=content, timeout=60)
-        assert found.status_code == 200, (name, found.text)
 
 
 def test_theme_tab_and_seed_survive_a_reload(studio: OpenPage) -> None:

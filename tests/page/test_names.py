@@ -1,7 +1,5 @@
 """Names that users give to factors and coordinates."""
 
-from __future__ import annotations
-
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage
 from tests.page.test_operation import AXE, check

@@ -1,9 +1,6 @@
 """The page as a whole: models, errors, a server that stops and starts, accessibility, download size."""
 
-from __future__ import annotations
-
 import re
-import socket
 from pathlib import Path
 
 import httpx
@@ -14,6 +11,7 @@ from tests.page.conftest import Open
 from tests.page.studio import OpenPage, difference
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start
+from tests.service.watching import free_port
 
 AXE = ROOT / "tests" / "node_modules" / "axe-core" / "axe.min.js"
 
@@ -88,9 +86,7 @@ def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
 
 
 def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, models: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     server = start(models, port=port)
     studio = window(server.url, complains=True).open()
     before = studio.picture()

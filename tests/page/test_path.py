@@ -1,7 +1,5 @@
 """Keyframes, the path through them, and colours for differences of shapes."""
 
-from __future__ import annotations
-
 import io
 import re
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Pulls at the surface, which leave pins: what follows, what stays, and the page's messages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -53,6 +51,8 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     first, second = hand(studio), hand(studio, right=False)
     pull(studio, first, (20, -25))
     studio.eventually(lambda: "The shape has followed" in studio.messages)
+    studio.rest()
+    assert hand(studio)[0] > first[0] + 10
     pins = studio[".pin"]
     assert pins.count() == 1
     at = pins.first.bounding_box()

@@ -1,7 +1,5 @@
 """Files not in correspondence: scans shown over the shape, verdicts, and undo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import httpx

@@ -1,7 +1,5 @@
 """The view and the sliders."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The shelf of named shapes, and two shapes side by side."""
 
-from __future__ import annotations
-
 import httpx
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Sharing what the page shows: pictures, videos, and frames in other pages."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterator
 from functools import partial

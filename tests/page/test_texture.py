@@ -1,7 +1,5 @@
 """Textures of the model's files."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page's scripts agree with the types in their comments, and are formatted by prettier."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 

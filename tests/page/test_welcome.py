@@ -1,7 +1,5 @@
 """The first seconds on the page without a code in its address."""
 
-from __future__ import annotations
-
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage, difference
 

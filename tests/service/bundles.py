@@ -1,7 +1,5 @@
 """Small bundles with networks built by hand, whose lengths and angles are known in closed form."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

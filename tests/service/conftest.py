@@ -1,7 +1,5 @@
 """A real server process for the tests: uvicorn on a free port, real bundles, real ONNX files."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

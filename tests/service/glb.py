@@ -1,7 +1,5 @@
 """Reading a GLB by its specification, independently of the code that wrote it."""
 
-from __future__ import annotations
-
 import json
 import struct
 import subprocess

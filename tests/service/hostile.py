@@ -1,7 +1,5 @@
 """Bundles that are well formed, with correct digests, but harmful when they are loaded or run."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

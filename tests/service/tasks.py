@@ -1,7 +1,5 @@
 """Tasks for a sandbox: good ones, and ones that break their process."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -1,7 +1,5 @@
 """Calls whose answers are recorded first, so that later answers can be compared byte for byte."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

@@ -1,9 +1,10 @@
 """Observing a server from outside: waiting for a condition, and reading metrics."""
 
-from __future__ import annotations
-
+import contextlib
+import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
@@ -20,6 +21,30 @@ def eventually(holds: Callable[[], bool], seconds: float = 120) -> None:
     while not holds():
         assert time.monotonic() < end, "the condition did not become true in time"
         time.sleep(0.02)
+
+
+def free_port() -> int:
+    """A port of this machine on which nobody listens."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def children_of(pid: int | str) -> list[int]:
+    """Ids of a process's children, zombies included; none if it has ended."""
+    found = []
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            found += map(int, (task / "children").read_text().split())
+    return found
+
+
+def processes(pid: int) -> list[int]:
+    """Ids of a process and of all processes that it has started, parents first."""
+    found = [pid]
+    for each in found:
+        found += children_of(each)
+    return found
 
 
 def samples(client: httpx.Client) -> Samples:

@@ -1,7 +1,5 @@
 """HTTP as bytes on a socket, for requests that HTTP clients don't send."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

@@ -1,7 +1,5 @@
 """Meshes on which laws are tested: closed, with boundary, of genus 1, each nearly flat and strongly bent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

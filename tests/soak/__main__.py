@@ -7,8 +7,6 @@ was wrong, an attack affected other clients, health took longer than a second, o
 handles grew.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools
@@ -30,6 +28,7 @@ from tests.attacks import ATTACKS, PROMPT
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.truth import Truth, bad_calls, fingerprint, good_calls
+from tests.service.watching import processes
 
 #: Largest growth between the second quarter of the time and the last, measured between attacks.
 GROWTH = {"MiB": 16.0, "threads": 0.0, "handles": 4.0}
@@ -41,20 +40,11 @@ ENDING = 3.0
 ATTACK, STRANGER = 60.0, "127.0.0.2"
 
 
-def processes(server: Server) -> list[Path]:
-    """The folders in /proc of a server's process and of its children."""
-    found = [Path(f"/proc/{server.process.pid}")]
-    for place in found:
-        with contextlib.suppress(OSError):
-            for task in (place / "task").iterdir():
-                found += [Path("/proc", pid) for pid in (task / "children").read_text().split()]
-    return found
-
-
 def measure(server: Server) -> dict[str, float]:
     """Memory, threads and file handles of a server and its child processes; pages that they share count once."""
     total = dict.fromkeys(GROWTH, 0.0)
-    for place in processes(server):
+    for pid in processes(server.process.pid):
+        place = Path(f"/proc/{pid}")
         with contextlib.suppress(OSError):  # a child may just have ended
             proportional = re.search(r"Pss:\s+(\d+)", (place / "smaps_rollup").read_text())
             total["MiB"] += int(proportional[1]) / 1024 if proportional else 0

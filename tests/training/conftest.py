@@ -1,7 +1,5 @@
 """A small run of the real command, whose files several tests read, and small collections."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import subprocess
@@ -76,25 +74,109 @@ licence = "MIT"
 STEPS = 4
 
 
+def small_config(
+    name: str,
+    data: str,
+    *,
+    vertices: int,
+    modes: int,
+    log_steps: int,
+    samples: int,
+    part_size: int,
+    epochs: int,
+    correction: str = 'kind = "kernel"',
+    evaluation: str = "reconstructions = 2",
+    skip_degree: int = 2,
+) -> str:
+    """The configuration of a run on meshes that takes seconds; monolithic networks are fitted as factors are."""
+    fit = f"fit = {{ batch_size = 16, max_epochs = {epochs} }}"
+    return f"""
+[collection]
+data = "{data}"
+coarse_vertices = {vertices}
+
+[modes]
+count = {modes}
+log_steps = {log_steps}
+
+[factors]
+count = 2
+
+[samples]
+count = {samples}
+steps = {log_steps}
+part_size = {part_size}
+
+[networks.factors]
+hidden = [16]
+skip_degree = {skip_degree}
+{fit}
+
+[networks.combiner]
+correction = {{ {correction} }}
+
+[monolithic]
+hidden = [16]
+{fit}
+
+[monolithic_paper]
+hidden = [16]
+{fit}
+
+[evaluation]
+{evaluation}
+
+[export]
+name = "{name}"
+title = "{name.capitalize()}"
+description = "A run for the tests."
+licence = "MIT"
+"""
+
+
 def command(config: Path, out: Path, *more: str) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "shapespace.training",
-        "run",
-        str(config),
-        "--out",
-        str(out),
-        "--models",
-        str(out / "models"),
-        *more,
-    ]
+    """The command that trains, with its bundles beside its results."""
+    places = ["--out", str(out), "--models", str(out / "models")]
+    return [sys.executable, "-m", "shapespace.training", "run", str(config), *places, *more]
+
+
+def train(config: Path, out: Path, *more: str) -> str:
+    """Run the command until it has succeeded, and return what it wrote on standard output."""
+    done = subprocess.run(command(config, out, *more), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no number of workers is given, all is computed in this process: small work is done before others start."""
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
+
+
+class Said:
+    """Runs ``shapespace-train`` in this process, which saves importing its libraries again; returns its output.
+
+    Attributes:
+        errors: what the last one wrote to standard error.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capsys, self.errors = monkeypatch, capsys, ""
+
+    def __call__(self, *arguments: str | Path, code: int = 0) -> str:
+        from shapespace.training.__main__ import main  # not needed by processes that only import this file
+
+        self._monkeypatch.setattr(sys, "argv", ["shapespace-train", *map(str, arguments)])
+        assert main() == code
+        captured = self._capsys.readouterr()
+        self.errors = captured.err
+        assert "Traceback" not in captured.err
+        return captured.out + captured.err
+
+
+@pytest.fixture
+def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
+    return Said(monkeypatch, capsys)
 
 
 def shared_run(factory: pytest.TempPathFactory, name: str, write: Callable[[Path], Path]) -> Path:
@@ -111,9 +193,7 @@ def shared_run(factory: pytest.TempPathFactory, name: str, write: Callable[[Path
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.exists():
             folder.mkdir()
-            done = subprocess.run(command(write(folder), folder / "run"), capture_output=True, text=True, check=False)
-            assert done.returncode == 0, done.stderr
-            (folder / "said.txt").write_text(done.stdout)
+            (folder / "said.txt").write_text(train(write(folder), folder / "run"))
     return folder / "run"
 
 

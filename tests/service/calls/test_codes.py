@@ -96,21 +96,6 @@ def test_an_edit_stays_inside_the_bounds(client: httpx.Client) -> None:
     assert found["residual"] > 0.5
 
 
-def test_an_edit_keeps_what_is_fixed_and_answers_its_posterior(client: httpx.Client) -> None:
-    shape, vertices = positions(client, [-0.1, 0.9, 0.8]), [3, 20, 45]
-    found = edit(client, shape[vertices], vertices, fixed={"2": 0.4, "0": 0.3}, samples=3, seed=2)
-    assert (found["latent"][0], found["latent"][2]) == (np.float32(0.3), np.float32(0.4))
-    assert not found["diagnostics"]["inside_bounds"]
-    covariance = np.array(found["covariance"])
-    assert covariance[1, 1] > 0
-    assert np.count_nonzero(covariance) == 1
-    assert [row[2] for row in found["samples"]] == [np.float32(0.4)] * 3
-    assert edit(client, shape[vertices], vertices)["samples"] == []
-    sure, unsure = ([{"vertex": 3, "position": shape[3].tolist(), "sigma": s}] for s in (0.01, 0.1))
-    spreads = [np.trace(edit(client, shape[:0], [], targets=t)["covariance"]) for t in (sure, unsure)]
-    assert spreads[0] < spreads[1]
-
-
 def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
     target = {"vertex": 0, "position": [0, 0, 0]}
     for change, says in (
@@ -158,21 +143,6 @@ def test_samples_depend_on_their_seed_alone_and_lie_inside_the_bounds(client: ht
     np.testing.assert_allclose(spread["uniform"] / (UPPER - LOWER), 0.2887, rtol=0.1)
     np.testing.assert_allclose(spread["gaussian"] / (UPPER - LOWER), 0.2199, rtol=0.1)
     np.testing.assert_array_equal(sample(), sample(count=1, seed=0, distribution="uniform"))
-
-
-def test_samples_of_the_population_are_like_the_training_codes(client: httpx.Client) -> None:
-    def sample(**body: Any) -> np.ndarray:
-        asked = {"count": 20, "distribution": "population"} | body
-        drawn = [client.post(SAMPLE, json=asked | {"seed": seed}).raise_for_status() for seed in range(25)]
-        return np.concatenate([answer.json()["latents"] for answer in drawn])
-
-    codes = sample()
-    # First and last coordinates of the training codes in tests.service.bundles; the second is an angle.
-    training = np.array([[0, 0], [0, 0.1], [0, 0.2], [0.1, 0.5], [0.1, 0.5]])
-    np.testing.assert_allclose(codes[:, [0, 2]].mean(axis=0), training.mean(axis=0), atol=0.15 * 0.1)
-    np.testing.assert_allclose(codes[:, [0, 2]].std(axis=0), training.std(axis=0), rtol=0.1)
-    narrow = sample(temperature=0.5)[:, [0, 2]]
-    np.testing.assert_allclose(narrow, (codes[:, [0, 2]] + training.mean(axis=0)) / 2, atol=1e-6)
 
 
 def test_bad_samples_are_told_what_to_do(client: httpx.Client) -> None:

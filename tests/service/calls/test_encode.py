@@ -166,15 +166,6 @@ def test_the_query_says_what_is_fixed_and_how_many_samples(client: httpx.Client)
         assert says in answer.json()["detail"]
 
 
-def test_a_mesh_in_centimetres_is_refused(client: httpx.Client) -> None:
-    vertices = 100 * SCALE * MESH.vertices
-    answer = client.post(ENCODE, content=as_json(vertices, MESH.faces), params={"format": "json"})
-    assert answer.status_code == 422
-    assert answer.json()["type"].endswith("invalid-mesh")
-    assert "about 100 times as large" in answer.json()["detail"]
-    assert "send it in the training meshes' units" in answer.json()["detail"]
-
-
 def test_faces_may_be_in_any_order_and_left_out_of_json(client: httpx.Client) -> None:
     shape = mesh_file(client).json()
     vertices, faces = np.array(shape["vertices"]), np.array(shape["faces"])

@@ -58,7 +58,13 @@ def as_npz(points: np.ndarray) -> bytes:
     return npz_bytes({"vertices": points})
 
 
-POINTS = {"xyz": as_xyz, "json": as_json, "ply": as_ply, "obj": as_obj, "off": as_off, "npz": as_npz}
+def as_pcd(points: np.ndarray) -> bytes:
+    head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {len(points)}\nHEIGHT 1\nDATA ascii\n"
+    return head.encode() + as_xyz(points)
+
+
+POINTS = {"xyz": as_xyz, "json": as_json, "ply": as_ply, "obj": as_obj, "off": as_off, "npz": as_npz, "pcd": as_pcd}
+POINTS |= dict.fromkeys(("pts", "csv", "txt"), as_xyz)
 
 
 @pytest.mark.parametrize("format", POINTS)

@@ -4,8 +4,6 @@ Calls and Python run unchanged, with a real server. Commands that need minutes o
 against the Makefile, the command line's parser, or a program's own help.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

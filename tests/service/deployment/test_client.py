@@ -55,17 +55,6 @@ def test_shapes_come_as_files_and_arrays(shapes: Client) -> None:
     assert shapes.mesh("small", CODES[0], "obj", version="2").startswith(b"v ")
 
 
-def test_codes_are_found(shapes: Client, tmp_path: Path) -> None:
-    codes = shapes.sample("with-fine", 3, seed=4)
-    assert codes.shape == (3, 3)
-    shape = shapes.shape("with-fine", codes[0])
-    (tmp_path / "shape.stl").write_bytes(shapes.mesh("with-fine", codes[0], "stl"))
-    found = [shapes.encode("with-fine", mesh) for mesh in (shape, tmp_path / "shape.stl")]
-    np.testing.assert_allclose(found[0]["latent"], found[1]["latent"], atol=1e-4)
-    places = {vertex: shape.vertices[vertex].tolist() for vertex in (0, 200, 400)}
-    assert shapes.edit("with-fine", codes[1], places, prior=0)["residual"] < 0.01
-
-
 def test_lengths_and_angles(shapes: Client) -> None:
     lengths, angles = shapes.nric("small", CODES)
     half = len(reference().edges)

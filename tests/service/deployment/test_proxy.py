@@ -1,7 +1,5 @@
 """The committed nginx configuration in a real nginx, in front of real replicas."""
 
-from __future__ import annotations
-
 import http.server
 import itertools
 import json
@@ -29,7 +27,7 @@ from shapespace.service.http.problems import TYPE_PREFIX
 from shapespace.service.use_cases.animation import ID_LENGTH
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
-from tests.service.watching import admitted, eventually, samples, value
+from tests.service.watching import admitted, eventually, free_port, samples, value
 
 NGINX = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin:/usr/local/sbin")
 # Continuous integration installs nginx. Linux, as the tests need several addresses on loopback.
@@ -66,9 +64,7 @@ def rendered(replicas: list[str], port: int) -> str:
 @contextmanager
 def proxying(folder: Path, *replicas: str) -> Iterator[str]:
     """An nginx in front of some replicas; yields its address."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     folder.mkdir()
     (folder / "server.conf").write_text(rendered(list(replicas), port))
     (folder / "nginx.conf").write_text(MAIN.format(user="user root;" if os.geteuid() == 0 else ""))

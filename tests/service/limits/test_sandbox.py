@@ -27,7 +27,7 @@ from shapespace.service.limits.sandbox_errors import (
 from shapespace.solve.deadline import Deadline
 from tests.service import tasks
 from tests.service.conftest import ROOT
-from tests.service.watching import eventually
+from tests.service.watching import children_of, eventually
 
 MIB = 2**20
 
@@ -51,20 +51,11 @@ def call(box: Sandbox, task: str, body: bytes = b"", seconds: float = 60, memory
     return box.call(task, facts, pieces, deadline=Deadline(seconds), memory=memory, most=most)
 
 
-def all_children() -> set[int]:
-    """Ids of this process's children, zombies included."""
-    return {
-        int(pid)
-        for task in Path("/proc/self/task").iterdir()
-        for pid in (task / "children").read_text().split()
-    }  # fmt: skip
-
-
 @pytest.fixture
 def children() -> Callable[[], set[int]]:
     """A function for the children started since the test began; servers of other tests may run too."""
-    before = all_children()
-    return lambda: all_children() - before
+    before = set(children_of("self"))
+    return lambda: set(children_of("self")) - before
 
 
 def alive(pid: int) -> bool:

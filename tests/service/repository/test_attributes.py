@@ -1,7 +1,5 @@
 """Bundles with what files have beside triangles: read as they were written, or refused."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

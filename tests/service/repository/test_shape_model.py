@@ -13,10 +13,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import TOLERANCE, MeshChoice, Quality
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import DeadlineError, Workers
-from shapespace.service.use_cases.batch import solve
 from shapespace.service.use_cases.shape_formats import summarise
-from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 from tests.service.bundles import networks, seal, start_network, write_bundle
 
@@ -50,17 +47,6 @@ def test_a_start_that_is_not_finite_is_not_used(steep: ShapeModel) -> None:
     shape = steep.shape(codes[0])
     assert shape.diagnostics.status is Status.CONVERGED
     assert np.isfinite(shape.vertices).all()
-
-
-def test_a_deadline_ends_gauss_newton(tmp_path: Path) -> None:
-    model = ShapeModel(read_bundle(write_bundle(tmp_path)))
-    codes, _ = model.latents.codes([[0.2, 1.0, 1.0]])
-    past = Deadline(-1)
-    assert model.shape(codes[0], deadline=past).diagnostics.status is Status.DEADLINE
-    workers = Workers(1, 0, deadline=1)
-    with pytest.raises(DeadlineError, match="within 1 s"):
-        solve(workers, model, MeshChoice.FINE, Quality.FULL, (codes[0], True), past)
-    workers.close()
 
 
 def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Attached parts: their anchors, and their positions beside a moving surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

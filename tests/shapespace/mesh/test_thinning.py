@@ -1,7 +1,5 @@
 """Thinning: the target number of vertices, the same topology, and no fold or sliver in any shape."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.encode_search import SETTINGS, EncodeSearch
 from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.options import PriorKind, Target
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.cholesky import NotPositiveDefiniteError
@@ -77,9 +78,10 @@ def test_shapes_are_those_of_the_server(models: Path, client: httpx.Client, name
 @pytest.mark.parametrize("name", ["with-fine", "figure"])
 def test_codes_are_those_of_the_server(models: Path, client: httpx.Client, name: str, tmp_path: Path) -> None:
     model = load(models / name)
-    for distribution in ("population", "uniform", "gaussian"):
-        codes = post(client, name, "sample", count=2, seed=3, distribution=distribution)["latents"]
-        np.testing.assert_array_equal(model.sample(2, 3, distribution), np.array(codes, np.float32))
+    for options in (("population", 0.5), ("population", 1.0), ("uniform", 1.0), ("gaussian", 1.0)):
+        asked = dict(zip(("distribution", "temperature"), options, strict=True))
+        codes = post(client, name, "sample", count=2, seed=3, **asked)["latents"]
+        np.testing.assert_array_equal(model.sample(2, 3, *options), np.array(codes, np.float32))
     shape = model.decode(codes[0])
     file = tmp_path / "shape.ply"
     file.write_bytes(MESH_FORMATS["ply"].encode(shape, model.faces))
@@ -90,13 +92,16 @@ def test_codes_are_those_of_the_server(models: Path, client: httpx.Client, name:
         answer[key] for key in ("residual", "iterations", "status")
     )
     assert answer["vertex_error"] == {"mean": found.distances.mean(), "max": found.distances.max()}
-    targets = {5: shape[5] + 0.05 * SCALE, 40: shape[40]}
-    pairs = [{"vertex": vertex, "position": place.tolist()} for vertex, place in targets.items()]
-    edited = post(client, name, "edit", latent=codes[1], targets=pairs, prior=1e-3)
-    changed = model.edit(codes[1], targets, prior=1e-3)
-    np.testing.assert_array_equal(changed.code, np.array(edited["latent"], np.float32))
-    assert changed.residual == edited["residual"]
-    np.testing.assert_array_equal(changed.distances, edited["distances"])
+    targets = [Target(5, (shape[5] + 0.05 * SCALE).tolist(), 0.01), Target(40, shape[40].tolist())]
+    pairs = [{name: value for name, value in asdict(target).items() if value is not None} for target in targets]
+    for more in ({}, {"fixed": {0: 0.3}, "samples": 2, "seed": 4, "prior_kind": PriorKind.RIDGE}):
+        edited = post(client, name, "edit", latent=codes[1], targets=pairs, prior=1e-3, **more)
+        changed = model.edit(codes[1], targets, prior=1e-3, **more)
+        np.testing.assert_array_equal(changed.code, np.array(edited["latent"], np.float32))
+        np.testing.assert_array_equal(changed.samples.ravel(), np.array(edited["samples"], np.float32).ravel())
+        np.testing.assert_allclose(edited["covariance"], changed.covariance, rtol=1e-12, atol=1e-18)
+        assert changed.residual == edited["residual"]
+        np.testing.assert_array_equal(changed.distances, edited["distances"])
 
 
 def test_a_mesh_is_encoded_from_vertices_meshes_and_files(model: ShapeModel, tmp_path: Path) -> None:

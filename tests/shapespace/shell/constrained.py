@@ -4,8 +4,6 @@ A simple, dense and slow reference for ``shapespace.shell.exponential``, for sma
 The two share the energy, but not the parametrisation by vertices.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

@@ -1,7 +1,5 @@
 """Distances between shapes, and residuals of paths."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shapespace.arrays import FloatArray

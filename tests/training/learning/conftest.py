@@ -1,7 +1,5 @@
 """Small meshes, with samples of their shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

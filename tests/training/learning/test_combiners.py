@@ -1,7 +1,5 @@
 """Combiners: every kind of correction learns how factors interact, from the shapes of factors alone."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Crops have the loss of the whole mesh on inner edges, and are drawn where the error is large."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

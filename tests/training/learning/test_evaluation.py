@@ -1,7 +1,5 @@
 """R² and the multilinear grid, in cases with known values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

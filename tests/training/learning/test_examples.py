@@ -1,7 +1,5 @@
 """Laws of corrections by examples: exact at the examples, nothing elsewhere. Each run checks its exported ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

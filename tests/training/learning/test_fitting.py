@@ -1,7 +1,5 @@
 """The training loop: it learns, and after a kill it continues to the same result."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from types import SimpleNamespace

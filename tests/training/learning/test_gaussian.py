@@ -1,7 +1,5 @@
 """Gaussian kernels and their gradients: derivatives, inner products, and what derivatives of samples are worth."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Ridge regression and principal axes: every way to compute them agrees with the definition."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

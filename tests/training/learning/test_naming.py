@@ -1,7 +1,5 @@
 """Names of factors and coordinates in a bundle."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

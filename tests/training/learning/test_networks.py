@@ -1,7 +1,5 @@
 """Laws of the networks: initial values, invariances, closed-form fits, and gradients coded by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The report of an artificial run: what it shows, what it omits, and that its pictures aren't empty."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -16,16 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from shapespace.mesh.triangle_mesh import TriangleMesh, vertex_normals
-from shapespace.training.__main__ import main
 from shapespace.training.report.number_format import duration
 from shapespace.training.report.page import write_report
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.report.rendering import Camera
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
+from tests.training.conftest import Said
 
 NASTY = "<script>alert('thumb')</script>"
 SECTIONS = {"nearness", "shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
@@ -33,22 +32,11 @@ CONFIG = '[collection]\n[export]\ntitle = "Sphere & Co <b>"\ndescription = "Made
 VOID = {"br", "hr", "img", "input", "link", "meta"}
 
 
-def sphere(rings: int = 12, sectors: int = 18) -> TriangleMesh:
-    """An ellipsoid, thinnest along z, with its poles closed."""
-    polar, azimuth = np.linspace(0, np.pi, rings + 1)[1:-1], 2 * np.pi * np.arange(sectors) / sectors
-    t, p = np.meshgrid(polar, azimuth, indexing="ij")
-    belt = np.stack([np.sin(t) * np.cos(p), np.cos(t), np.sin(t) * np.sin(p)], axis=-1).reshape(-1, 3)
-    vertices = np.vstack([belt, [0, 1, 0], [0, -1, 0]]) * [1.0, 1.4, 0.7]
-    faces = []
-    for s in range(sectors):
-        n = (s + 1) % sectors
-        faces.append([n, s, len(belt)])
-        faces.append([(rings - 2) * sectors + s, (rings - 2) * sectors + n, len(belt) + 1])
-        for r in range(rings - 2):
-            a, b, c, d = r * sectors + s, r * sectors + n, (r + 1) * sectors + s, (r + 1) * sectors + n
-            faces += [[a, b, c], [b, d, c]]
-    mesh = TriangleMesh.from_arrays(vertices, np.array(faces))
-    return mesh.with_vertices(vertices / np.sqrt(mesh.area))
+def ellipsoid() -> TriangleMesh:
+    """An ellipsoid of unit area, thinnest along z."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    mesh = TriangleMesh.from_arrays(ball.vertices * [1.0, 1.4, 0.7], ball.faces)
+    return mesh.with_vertices(mesh.vertices / np.sqrt(mesh.area))
 
 
 def score(total: float) -> dict[str, float]:
@@ -58,7 +46,7 @@ def score(total: float) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "made-up"
-    mesh, rng = sphere(), np.random.default_rng(0)
+    mesh, rng = ellipsoid(), np.random.default_rng(0)
     x, faces, m = mesh.vertices, mesh.faces, 4
     normals = vertex_normals(x, faces)
     bumps = np.exp(-((x[None] - x[rng.choice(len(x), m)][:, None]) ** 2).sum(axis=-1) / 0.01)[..., None] * normals
@@ -369,22 +357,15 @@ def test_a_broken_file_is_named_in_one_line(tmp_path: Path, name: str, content: 
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_no_run_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", "report", str(tmp_path)])
-    assert main() == 1
-    assert capsys.readouterr().err == f"shapespace-train: {tmp_path} is no run directory: it holds no config.toml\n"
+def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path, said: Said) -> None:
+    words = said("report", tmp_path, code=1)
+    assert words == said.errors == f"shapespace-train: {tmp_path} is no run directory: it holds no config.toml\n"
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_says_where_the_page_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_where_the_page_is(tmp_path: Path, said: Said) -> None:
     (tmp_path / "config.toml").write_text(CONFIG)
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", "report", str(tmp_path)])
-    assert main() == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'report.html'}\n"
+    assert said("report", tmp_path) == f"{tmp_path / 'report.html'}\n"
 
 
 def test_the_report_needs_no_torch(tmp_path: Path) -> None:
@@ -401,7 +382,7 @@ def test_the_report_needs_no_torch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("thin", [0, 1, 2])
 def test_a_camera_sees_all_of_every_shape_from_its_broad_side(thin: int) -> None:
-    mesh = sphere()
+    mesh = ellipsoid()
     x = np.roll(mesh.vertices, thin - 2, axis=1)
     aside = x + np.array([0.5, 0, 0])
     camera = Camera.facing(x, mesh.faces, [x, aside])
@@ -417,7 +398,7 @@ def test_a_camera_sees_all_of_every_shape_from_its_broad_side(thin: int) -> None
 
 
 def test_light_comes_from_above_on_both_sides_of_a_surface() -> None:
-    mesh = sphere()
+    mesh = ellipsoid()
     camera = Camera.facing(mesh.vertices, mesh.faces)
     for faces in (mesh.faces, mesh.faces[:, ::-1]):
         pixels = camera.render(mesh.vertices, faces, (0.7, 0.7, 0.7), 100).astype(float)

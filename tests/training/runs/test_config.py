@@ -1,7 +1,5 @@
 """Invalid configurations are refused with a sentence; those in the repository are valid."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import get_args
 

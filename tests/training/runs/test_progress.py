@@ -1,7 +1,5 @@
 """Progress: nothing for the first seconds, then whole lines, suitable for a log."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

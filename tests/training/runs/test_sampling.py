@@ -1,7 +1,5 @@
 """Samples computed by real processes that are killed, without and with a local Dask cluster."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle
@@ -24,7 +22,7 @@ from shapespace.training.runs import workers
 from shapespace.training.runs.sampling import columns, draw, read, split, used
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.shell_collection import ShellCollection
-from tests.training.conftest import TINY
+from tests.training.conftest import TINY, Said
 from tests.training.runs.deadly import die_once
 
 DRAW = """
@@ -198,18 +196,13 @@ def test_a_cluster_without_workers_is_given_up(dask: Callable, tmp_path: Path, m
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: Said
 ) -> None:
-    from shapespace.training import __main__  # imports torch, which worker processes don't need
-
     monkeypatch.setattr(workers, "CONNECT", 0.5)
     (tmp_path / "tiny.toml").write_text(TINY)
-    arguments = ["run", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "run"), "--scheduler", "tcp://127.0.0.1:9"]
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
-    assert __main__.main() == __main__.FAILURE
-    message = capsys.readouterr().err
-    assert message.startswith("shapespace-train: no Dask scheduler answers at tcp://127.0.0.1:9")
-    assert message.count("\n") == 1
+    said("run", tmp_path / "tiny.toml", "--out", tmp_path / "run", "--scheduler", "tcp://127.0.0.1:9", code=1)
+    assert said.errors.startswith("shapespace-train: no Dask scheduler answers at tcp://127.0.0.1:9")
+    assert said.errors.count("\n") == 1
 
 
 # ---------------------------------------------------------------- failures and indices

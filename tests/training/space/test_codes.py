@@ -1,7 +1,5 @@
 """Codes of shapes and their bounds, on an ellipsoid with known modes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

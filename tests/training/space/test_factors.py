@@ -1,7 +1,5 @@
 """Factors of modes with known supports."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

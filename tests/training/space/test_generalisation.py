@@ -1,7 +1,5 @@
 """Distance of held-out shapes from the space and from principal components, on a bending ellipsoid."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The mean of a collection."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

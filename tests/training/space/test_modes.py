@@ -1,7 +1,5 @@
 """Modes of an ellipsoid with three bumps that move independently of each other."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -20,15 +18,7 @@ from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import (
-    ModeError,
-    Modes,
-    Norm,
-    coefficients,
-    localisation,
-    mode_count,
-    pga,
-)
+from shapespace.training.space.modes import ModeError, Modes, Norm, coefficients, localisation, mode_count, pga
 from shapespace.training.space.sparse_modes import _fit_in_box, spga
 from tests.shapespace.conftest import bent
 

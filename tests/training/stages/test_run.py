@@ -1,7 +1,5 @@
 """Runs of version 0.2 continue; a setting belongs to its stage; the list of stages is complete."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

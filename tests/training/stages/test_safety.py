@@ -1,7 +1,5 @@
 """What a run never does: write into other folders, read devices, end for good at a damaged file, or leave processes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -12,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.training.__main__ import main
 from shapespace.training.runs.atomic_files import DamagedFileError, JsonFile, NpzFile
 from shapespace.training.runs.directory import NotARunError, RunDirectory
-from tests.training.conftest import TINY, command
+from tests.training.conftest import TINY, Said, command
 
 MINE = """
 [collection]
@@ -36,51 +33,36 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, config: Path, out: Path, *more: str) -> int:
-    monkeypatch.setattr("sys.argv", ["shapespace-train", *command(config, out, *more)[3:]])
-    return main()
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize(
-    "name", ["shapes.npz", "report.html", "samples/mine.txt", "config.toml", "notes.txt", ".hidden"]
-)
-def test_a_folder_with_other_files_is_left_alone(
-    name: str, config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("name", FOREIGN)
+def test_a_folder_with_other_files_is_left_alone(name: str, config: Path, tmp_path: Path, said: Said) -> None:
     mine = tmp_path / "mine"
     (mine / name).parent.mkdir(parents=True)
     (mine / name).write_text("mine")
-    assert run(monkeypatch, config, mine, "--until", "ingest") == 1
-    assert "is no run directory" in capsys.readouterr().err
+    said("run", config, "--out", mine, "--until", "ingest", code=1)
+    assert "is no run directory" in said.errors
     assert contents(mine) == {name: b"mine"}
 
 
-def test_a_file_in_place_of_the_folder_is_left_alone(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_in_place_of_the_folder_is_left_alone(config: Path, tmp_path: Path, said: Said) -> None:
     (tmp_path / "mine").write_text("mine")
-    assert run(monkeypatch, config, tmp_path / "mine") == 1
+    said("run", config, "--out", tmp_path / "mine", code=1)
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_empty_folders_and_runs_are_continued(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    for _ in range(2):
-        assert run(monkeypatch, config, out, "--until", "ingest") == 0
-    killed = tmp_path / "killed"  # before it had written its configuration
-    (killed / "stages").mkdir(parents=True)
-    assert run(monkeypatch, config, killed, "--until", "ingest") == 0
+def test_empty_folders_and_runs_are_continued(config: Path, tmp_path: Path, said: Said) -> None:
+    empty, killed = tmp_path / "out", tmp_path / "killed"
+    empty.mkdir()
+    (killed / "stages").mkdir(parents=True)  # killed before it had written its configuration
+    for out in (empty, empty, killed):
+        said("run", config, "--out", out, "--until", "ingest")
 
 
 @pytest.mark.parametrize("place", ["", "shapes.npz", "samples/mine.npz"])
-def test_data_inside_the_results_are_refused(
-    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_inside_the_results_are_refused(place: str, tmp_path: Path, said: Said) -> None:
     out = tmp_path / "out"
     data = out / place
     RunDirectory(out).begin()
@@ -91,24 +73,22 @@ def test_data_inside_the_results_are_refused(
     config = tmp_path / "mine.toml"
     config.write_text(MINE.format(data))
     before = contents(out)
-    assert run(monkeypatch, config, out) == 1
-    assert "writes its results" in capsys.readouterr().err
+    said("run", config, "--out", out, code=1)
+    assert "writes its results" in said.errors
     assert contents(out) == before
 
 
-def test_devices_are_no_collections(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_devices_are_no_collections(tmp_path: Path, said: Said) -> None:
     config = tmp_path / "mine.toml"
     config.write_text(MINE.format("/dev/zero"))
-    assert run(monkeypatch, config, tmp_path / "out") == 1
-    assert "neither a file nor a folder" in capsys.readouterr().err
+    said("run", config, "--out", tmp_path / "out", code=1)
+    assert "neither a file nor a folder" in said.errors
     os.mkfifo(tmp_path / "pipe.obj")
     config.write_text(MINE.format(tmp_path))
     for name in ("a", "b"):
         (tmp_path / f"{name}.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert run(monkeypatch, config, tmp_path / "out") == 1
-    assert "pipe.obj: can't be read" in capsys.readouterr().err
+    said("run", config, "--out", tmp_path / "out", code=1)
+    assert "pipe.obj: can't be read" in said.errors
 
 
 def flip(path: Path, place: int) -> None:
@@ -117,21 +97,18 @@ def flip(path: Path, place: int) -> None:
     path.write_bytes(content)
 
 
-def test_damaged_results_are_named_and_made_again(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_results_are_named_and_made_again(config: Path, tmp_path: Path, said: Said) -> None:
     out = tmp_path / "out"
-    assert run(monkeypatch, config, out, "--until", "samples") == 0
+    run = "run", config, "--out", out, "--until"
+    said(*run, "samples")
     part = out / "samples" / "part-00001.npz"
     arrays = NpzFile(part).read()
     flip(part, part.read_bytes().index(b"nric.npy") + 5000)
-    capsys.readouterr()
-    assert run(monkeypatch, config, out, "--until", "networks") == 0
-    assert "samples/part-00001.npz: damaged, so it is removed, and samples makes it again" in capsys.readouterr().out
+    words = said(*run, "networks")
+    assert "samples/part-00001.npz: damaged, so it is removed, and samples makes it again" in words
     np.testing.assert_equal(NpzFile(part).read(), arrays)
     RunDirectory(out).stamp("samples").path.write_bytes(b"damaged")
-    assert run(monkeypatch, config, out, "--until", "samples") == 0
-    assert "stages/samples.json: damaged" in capsys.readouterr().out
+    assert "stages/samples.json: damaged" in said(*run, "samples")
     np.testing.assert_equal(NpzFile(part).read(), arrays)
 
 

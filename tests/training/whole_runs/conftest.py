@@ -1,7 +1,5 @@
 """A collection of textured bars in several parts, and one run of the real command on it."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -12,54 +10,20 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.runs.config import load
 from shapespace.training.stages.stage import Run
 from tests.surfaces import ball, with_parts, write_files
-from tests.training.conftest import shared_run
+from tests.training.conftest import shared_run, small_config
 
-CONFIG = """
-[collection]
-data = "meshes"
-coarse_vertices = 120
-
-[modes]
-count = 3
-log_steps = 4
-
-[factors]
-count = 2
-
-[samples]
-count = 60
-steps = 4
-part_size = 10
-
-[networks.factors]
-hidden = [16]
-skip_degree = 2
-fit = { batch_size = 16, max_epochs = 8 }
-
-[networks.combiner]
-correction = { kind = "kernel", coefficients = 4 }
-
-[monolithic]
-hidden = [16]
-fit = { batch_size = 16, max_epochs = 8 }
-
-[monolithic_paper]
-hidden = [16]
-fit = { batch_size = 16, max_epochs = 8 }
-
-[evaluation]
-grid_nodes = 5
-grid_size = 30
-reconstructions = 4
-
-[export]
-name = "bars"
-title = "Bars"
-description = "A run for the tests."
-licence = "MIT"
-"""
-
-
+CONFIG = small_config(
+    "bars",
+    "meshes",
+    vertices=120,
+    modes=3,
+    log_steps=4,
+    samples=60,
+    part_size=10,
+    epochs=8,
+    correction='kind = "kernel", coefficients = 4',
+    evaluation="grid_nodes = 5\ngrid_size = 30\nreconstructions = 4",
+)
 SPHERE, SURFACE = with_parts(ball())
 EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, SURFACE.sizes)]) for k in range(3))
 

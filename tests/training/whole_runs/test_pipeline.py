@@ -1,7 +1,5 @@
 """The real command on a small torus: its files, which stages it repeats, and what a kill costs."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

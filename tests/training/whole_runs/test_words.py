@@ -24,7 +24,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.faults.training import CONFIG, bars
-from tests.training.conftest import TINY
+from tests.training.conftest import TINY, Said
 from tests.training.whole_runs.test_collection import results
 
 SHAPES, FACES = bars(6)
@@ -43,30 +43,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "bars.toml").write_text(CONFIG.replace("bars.npz", "meshes"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-class Said:
-    """Runs the command in this process, which saves importing torch again, and returns its output.
-
-    Attributes:
-        errors: what the last one wrote to standard error.
-    """
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self._monkeypatch, self._capsys, self.errors = monkeypatch, capsys, ""
-
-    def __call__(self, *arguments: str, code: int = 0) -> str:
-        self._monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
-        assert command.main() == code
-        captured = self._capsys.readouterr()
-        self.errors = captured.err
-        assert "Traceback" not in captured.err
-        return captured.out + captured.err
-
-
-@pytest.fixture
-def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
-    return Said(monkeypatch, capsys)
 
 
 def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) -> None:
