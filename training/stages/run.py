@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from shapespace.bundle.writer import require_replaceable
 from shapespace.training.collection.reading import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
@@ -75,6 +76,7 @@ def execute(
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
         NotARunError: the run directory holds something else, or the collection's data.
+        BundleError: the place of the bundle holds something else.
         DamagedFileError: a file was damaged, and was so again after its stage had made it anew.
     """
     repaired = set[Path]()
@@ -106,6 +108,8 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
     directory = run.directory
     keys, data = _prepare(run, show)
     order = list(STAGES)
+    if until in (None, "export") and "seconds" not in directory.stamp("export").read_if_written():
+        require_replaceable(run.bundle)  # before hours of work
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
