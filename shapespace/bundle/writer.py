@@ -77,6 +77,9 @@ def require_replaceable(folder: Path) -> None:
     Raises:
         BundleError: the folder has files that are not of a bundle, or is a file or a link.
     """
+    for parent in folder.parents:
+        if parent.exists() and not parent.is_dir():
+            raise BundleError(f"{parent} is a file, and bundles lie in a folder: choose another folder for them")
     if not os.path.lexists(folder):
         return
     remedy = "nothing is replaced there: move it away, or choose another folder, name or version for the bundle"

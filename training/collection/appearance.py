@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.files.attributes.reading import FORMATS, read_attributes
+from shapespace.files.limits import in_words
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.training.collection.mesh_collection import MeshCollection
@@ -34,7 +35,8 @@ def reference_surface(
             found = found.welded(meshes.file_vertices)
             found.check(meshes.vertices.shape[1], meshes.faces)
     except (OSError, MeshError) as error:
-        found, faults = None, [f"its polygons, texture coordinates and materials are left out: {error}"]
+        why = in_words(error, named=False) if isinstance(error, OSError) else error
+        found, faults = None, [f"its polygons, texture coordinates and materials are left out: {why}"]
     return found, [f"{path}: {fault}" for fault in faults]
 
 

@@ -8,6 +8,7 @@ import re
 import unicodedata
 from pathlib import Path
 
+from shapespace.files.limits import in_words
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import ConfigError
@@ -112,8 +113,12 @@ def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tupl
     data = Path(os.path.relpath(full, out.parent.resolve())).as_posix()
     try:
         out.write_bytes(configuration(collection, data, title).encode())
-    except (OSError, UnicodeEncodeError) as error:
-        raise ConfigError(f"{out}: can't be written: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{out}: can't be written: {in_words(error, named=False)}") from error
+    except UnicodeEncodeError as error:
+        raise ConfigError(
+            f"{out}: can't be written: a name in it is no text; rename the folder or its files"
+        ) from error
     return out, collection
 
 

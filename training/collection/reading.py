@@ -11,6 +11,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.archives import natural_order
+from shapespace.files.limits import in_words
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.reading import READ_FORMATS, read_arrays
 from shapespace.mesh.triangle_mesh import MeshError, PlaceError, on_shared_vertices
@@ -210,7 +211,7 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         arrays = read_mesh_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
     except OSError as error:
-        raise MeshError(f"can't be read: {error.strerror}") from error
+        raise MeshError(f"can't be read: {in_words(error, named=False)}") from error
     shapes = arrays["vertices"]
     if shapes.ndim != 3 or shapes.shape[2] != 3:
         raise MeshError(f"vertices must be an (n, V, 3) array, not of shape {shapes.shape}")

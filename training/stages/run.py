@@ -17,6 +17,7 @@ from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.stages import (  # fmt: skip
+    STAGE_NAMES,
     evaluation,
     export,
     factors,
@@ -29,10 +30,8 @@ from shapespace.training.stages import (  # fmt: skip
 )
 from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
-STAGES: dict[str, Stage] = {
-    module.STAGE.name: module.STAGE
-    for module in (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
-}
+_MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
+STAGES: dict[str, Stage] = {name: module.STAGE for name, module in zip(STAGE_NAMES, _MODULES, strict=True)}
 
 
 class OldRunError(ValueError):

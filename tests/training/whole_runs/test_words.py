@@ -18,6 +18,7 @@ import pytest
 
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
+from shapespace.training.commands import HOME
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
@@ -61,6 +62,7 @@ class Said:
         captured = self._capsys.readouterr()
         self.errors = captured.err
         assert "Traceback" not in captured.err
+        assert "Errno" not in captured.err
         return captured.out + captured.err
 
 
@@ -71,13 +73,27 @@ def said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) -> None:
     (place / "bad.toml").write_text("[collection]\n")
+    (place / "latin.toml").write_bytes("# Größe".encode("latin-1"))
+    (place / "models" / "bars" / "1").mkdir(parents=True)
+    (place / "models" / "bars" / "1" / "pose.obj").touch()
     for arguments, says in (
         (("run", "bad.toml"), "export: Field required"),
-        (("run", "none.toml"), "can't be read"),
+        (("run", "none.toml"), "none.toml: can't be read: there is no such file or folder"),
+        (("run", "meshes"), "meshes: can't be read: it is a folder"),
+        (("run", "latin.toml"), "it is no text in UTF-8"),
+        (("run", "bars.toml", "--out", "bad.toml/x"), "bad.toml/x/stages: it is a file or lies below one"),
+        (("run", "bars.toml", "--data", "none", "--until", "ingest"), "none: no such file or folder"),
+        (("run", "bars.toml"), "models/bars/1 holds pose.obj, which no export wrote"),
+        (("run", "bars.toml", "--models", "bad.toml"), "bad.toml is a file, and bundles lie in a folder"),
+        (("init", "meshes", "--out", "none/bars.toml"), "none/bars.toml: can't be written: there is no such"),
+        (("init", "meshes", "--out", "meshes", "--force"), "meshes: can't be written: it is a folder"),
         (("status", "nowhere"), "is no run directory"),
+        (("report", "meshes"), "is no run directory"),
+        (("export", "bad.toml"), "is no run directory"),
     ):
         said(*arguments, code=1)
-        assert says in said.errors
+        assert says in said.errors, arguments
+        assert len(said.errors.splitlines()) <= 2, said.errors
 
 
 def test_status_tells_how_far_a_run_is(run: Path, said: Said) -> None:
@@ -197,7 +213,7 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_nobody_disturbed(place: Path,
         [sys.executable, "-m", "shapespace.training", *killed],
         stdout=subprocess.DEVNULL,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+        env={**os.environ, "PYTHONPATH": str(HOME)},
     )
     while not list(place.glob("killed/samples/part-*.npz")):
         assert process.poll() is None, "the run ended before it could be killed"
@@ -295,7 +311,7 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+        env={**os.environ, "PYTHONPATH": str(HOME)},
     )
     assert done.returncode == 70
     assert "Traceback" not in done.stderr
