@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 SHORT_KEY = 16
 #: Packages of the extra ``serve`` by the names of their modules, without those that are only faster.
 NEEDED = (
-    "cachetools", "fastapi", "httptools", "onnx", "onnxruntime", "orjson", "prometheus_client", "pydantic", "pydantic_settings",
-    "python_multipart", "pythonjsonlogger", "starlette", "threadpoolctl", "trimesh", "uvicorn",
+    "cachetools", "fastapi", "httptools", "onnx", "onnxruntime", "orjson", "prometheus_client", "pydantic",
+    "pydantic_settings", "python_multipart", "pythonjsonlogger", "starlette", "threadpoolctl", "trimesh", "uvicorn",
 )  # fmt: skip
 
 

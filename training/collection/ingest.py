@@ -21,6 +21,8 @@ from shapespace.training.collection.checks import (
     orientation_notes,
     refusing,
 )
+from shapespace.training.collection.faults import Faults, IngestError
+from shapespace.training.collection.listing import MIN_SHAPES
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.collection.parts import MeshPart, parts_note, select_parts
 from shapespace.training.collection.reading import FileShapes, read_shapes
@@ -34,26 +36,47 @@ from shapespace.training.collection.welding import (
 )
 
 
-def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
+def read_collection(path: Path, wanted: Sequence[str] = (), file: str | None = None) -> MeshCollection:
     """Read a folder of OBJ, PLY, STL, OFF, glTF or NPZ files, or one NPZ of ``vertices`` (n, V, 3) and ``faces``.
 
     Vertices that coincide in every shape become one, see `welding`. Vertices in no face are left out. Files of other
-    kinds and subfolders are ignored.
+    kinds and subfolders are left out, and the notes name them.
 
     Args:
         path: the folder or file.
         wanted: names of the parts to keep, see `parts.select_parts`.
+        file: name of the file to read from each folder in ``path``, see `listing.mesh_files`.
 
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, different connectivity, an edge with more
             than two faces or with oppositely oriented ones, a face without area, a coordinate that isn't finite,
             several parts of which one can't be attached to another, or shapes that are all equal or partly mirrored.
-            Vertices and faces are numbered as in the file, from 1 in OBJ.
+            It has all faults of all files. Vertices and faces are numbered as in the file, from 1 in OBJ.
     """
-    files = read_shapes(path)
+    files = read_shapes(path, file)
+    faults = Faults(*files.faults)
+    with faults.gathered():
+        collection = _checked(path, files, wanted, faults)
+        if faults.found:
+            faults.found += collection.grave_faults()
+    faults.refuse()
+    return collection
+
+
+def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Faults) -> MeshCollection:
+    """Make a collection of the valid shapes, and add the faults of the others.
+
+    Raises:
+        IngestError: the valid shapes can't be used, or are too few beside others that have faults.
+    """
     source = files.sources[0]
     given = NumberedShapes.from_files(files.vertices, files.faces)
-    check_meshes(files.sources, given.vertices, given.faces, given.file_numbers)
+    valid = check_meshes(files.sources, given.vertices, given.faces, given.file_numbers, faults)
+    if faults.found and len(valid) < MIN_SHAPES:
+        raise IngestError(*faults.found)
+    if len(valid) < len(files.sources):
+        files = files.only(valid)
+        given = NumberedShapes.from_files(files.vertices, files.faces)
     check_different(path, given.vertices)
 
     coincidences = find_coincidences(given.vertices)
@@ -61,7 +84,7 @@ def read_collection(path: Path, wanted: Sequence[str] = ()) -> MeshCollection:
         shapes = weld(given, coincidences.first)
     with refusing(source, shapes.file_numbers):
         seams = find_open_seams(shapes)
-    notes = _welding_notes(files, given, shapes, coincidences)
+    notes = [*files.notes, *_welding_notes(files, given, shapes, coincidences)]
 
     parts, left_out = select_parts(files, wanted, shapes, coincidences.shares, seams)
     if parts:

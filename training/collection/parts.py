@@ -13,7 +13,8 @@ from scipy import sparse
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, diagonal, face_areas
-from shapespace.training.collection.checks import TOLERANCES, IngestError, refusing
+from shapespace.training.collection.checks import TOLERANCES, refusing
+from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.part_names import listed, may_have_names, part_names, reordered
 from shapespace.training.collection.reading import FileShapes
 from shapespace.training.collection.welding import NumberedShapes
@@ -105,20 +106,23 @@ def parts_note(parts: Sequence[MeshPart], left_out: Sequence[MeshPart]) -> str:
 
 def _check_triangle_order(files: FileShapes, welded: FloatArray) -> None:
     """Refuse STL files in different orders: corners of triangles that meet in one file don't meet in the other."""
-    odd = int(welded.argmin())
-    if files.triangles_only and welded[odd] < 0.5:
-        raise IngestError(
-            f"{files.sources[odd].label}: its triangles don't meet where those of {files.sources[0].label} do; STL "
-            "files must list the faces in the same order"
-        )
+    if files.triangles_only and (welded < 0.5).any():
+        what = f"its triangles don't meet where those of {files.sources[0].label} do"
+        remedy = "STL files must list the faces in the same order"
+        raise IngestError(*(Fault(files.sources[k].label, what, remedy) for k in np.flatnonzero(welded < 0.5)))
 
 
 def _check_part_order(files: FileShapes) -> Path | None:
     """Return the first file that can name parts, if any; refuse files that list the same parts in another order."""
     template = next((path for path in files.paths if may_have_names(path)), None)
-    for path in files.paths:
-        if template and path != template and (fault := reordered(path, template)):
-            raise IngestError(f"{path}: {fault}, unlike those of {template.name}; export it like the others")
+    odd = [(path, reordered(path, template)) for path in files.paths if template and path != template]
+    faults = [
+        Fault(str(path), f"{why}, unlike those of {template.name}", "export it like the others")
+        for path, why in odd
+        if why
+    ]
+    if faults:
+        raise IngestError(*faults)
     return template
 
 

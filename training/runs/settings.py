@@ -31,6 +31,9 @@ class CollectionSettings(SettingsTable):
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF or glTF files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``; relative
     to the configuration's own folder. The command's ``--data`` takes precedence."""
+    file: str | None = None
+    """Name of the file to read from each folder in ``data``, for data with one folder per subject. It may be a path, as
+    ``surf/pial.ply``, and have ``*`` and ``?`` in it, as ``*_mesh.ply``. Shapes have the names of the folders."""
     reference: str | None = None
     """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
     most central one."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.bundle.writer import require_replaceable
-from shapespace.training.collection.reading import data_files
+from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import NotARunError, RunDirectory
@@ -195,14 +195,15 @@ def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
     """
     source = run.config.collection.data
     known, found = run.directory.data.read_if_written(), {}
-    for path in data_files(source) if source else ():
+    for path in data_files(source, run.config.collection.file) if source else ():
+        name = path.relative_to(source).as_posix() if source and path != source else path.name
         stat = path.stat()
         facts = {"bytes": stat.st_size, "time": stat.st_mtime_ns}
-        before = known.get(path.name, {})
-        if any(before.get(name) != value for name, value in facts.items()):
+        before = known.get(name, {})
+        if any(before.get(fact) != value for fact, value in facts.items()):
             with path.open("rb") as file:
                 before = {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-        found[path.name] = {**facts, "sha256": before["sha256"]}
+        found[name] = {**facts, "sha256": before["sha256"]}
     return found
 
 
