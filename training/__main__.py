@@ -32,6 +32,14 @@ def parser() -> CommandParser:
     start = _add_command(commands, "init", "write a configuration for a folder of meshes in correspondence")
     start.add_argument("meshes", type=Path, metavar="MESH_DIR", help="OBJ, PLY, STL, OFF or glTF files, or one NPZ")
     start.add_argument("--out", type=Path, metavar="FILE.toml", help="default: the folder's name, here")
+    start.add_argument("--file", metavar="NAME", help="file to read from each folder in MESH_DIR, one for each subject")
+    start.add_argument(
+        "--parts",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="parts to keep, the main one first",
+    )
     start.add_argument("--force", action="store_true", help="replace the file if it is there")
 
     run = _add_command(commands, "run", "do the stages of a configuration that are not done yet")

@@ -16,7 +16,7 @@ from pathlib import Path
 from shapespace.bundle.reader import BundleError
 from shapespace.files.limits import in_words
 from shapespace.training.collection import init
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.learning import ExportError
 from shapespace.training.report.record import Record, ReportError
 from shapespace.training.runs import workers
@@ -86,7 +86,9 @@ def _open(folder: Path, models: Path) -> Run:
 
 
 def _init(arguments: argparse.Namespace) -> None:
-    out, collection = init.write(arguments.meshes, arguments.out, force=arguments.force)
+    out, collection = init.write(
+        arguments.meshes, arguments.out, force=arguments.force, parts=arguments.parts, file=arguments.file
+    )
     shapes, vertices = collection.vertices.shape[:2]
     print(f"{out}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
     for note in (*collection.notes, *(warning.sentence for warning in collection.warnings)):

@@ -36,7 +36,7 @@ from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_files
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle

@@ -36,7 +36,9 @@ from shapespace.training.collection.welding import (
 )
 
 
-def read_collection(path: Path, wanted: Sequence[str] = (), file: str | None = None) -> MeshCollection:
+def read_collection(
+    path: Path, wanted: Sequence[str] = (), file: str | None = None, *, alone: bool = False
+) -> MeshCollection:
     """Read a folder of OBJ, PLY, STL, OFF, glTF or NPZ files, or one NPZ of ``vertices`` (n, V, 3) and ``faces``.
 
     Vertices that coincide in every shape become one, see `welding`. Vertices in no face are left out. Files of other
@@ -46,6 +48,7 @@ def read_collection(path: Path, wanted: Sequence[str] = (), file: str | None = N
         path: the folder or file.
         wanted: names of the parts to keep, see `parts.select_parts`.
         file: name of the file to read from each folder in ``path``, see `listing.mesh_files`.
+        alone: whether the largest part is kept alone where not all can be kept, see `parts.select_parts`.
 
     Raises:
         IngestError: nothing to read, fewer than 3 shapes, an unreadable file, different connectivity, an edge with more
@@ -56,14 +59,14 @@ def read_collection(path: Path, wanted: Sequence[str] = (), file: str | None = N
     files = read_shapes(path, file)
     faults = Faults(*files.faults)
     with faults.gathered():
-        collection = _checked(path, files, wanted, faults)
+        collection = _checked(path, files, wanted, faults, alone=alone)
         if faults.found:
             faults.found += collection.grave_faults()
     faults.refuse()
     return collection
 
 
-def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Faults) -> MeshCollection:
+def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Faults, *, alone: bool) -> MeshCollection:
     """Make a collection of the valid shapes, and add the faults of the others.
 
     Raises:
@@ -86,10 +89,11 @@ def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Fault
         seams = find_open_seams(shapes)
     notes = [*files.notes, *_welding_notes(files, given, shapes, coincidences)]
 
-    parts, left_out = select_parts(files, wanted, shapes, coincidences.shares, seams)
+    selection = select_parts(files, wanted, shapes, coincidences.shares, seams, alone=alone)
+    parts = selection.kept
     if parts:
-        notes.append(parts_note(parts, left_out))
-    if left_out:
+        notes.append(parts_note(selection))
+    if selection.left_out:
         shapes, parts = _without_other_parts(shapes, parts)
     notes += _seam_notes(seams)
     shell = shapes.faces[parts[0].faces] if parts else shapes.faces
@@ -105,6 +109,8 @@ def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Fault
         central=placements.central,
         places=tuple((source.file, source.first) for source in files.sources),
         parts=tuple(parts) if len(parts) > 1 else (),
+        part_sizes=tuple(selection.sizes),
+        kept_alone=parts[0].own if selection.why else None,
     )
 
 
@@ -137,7 +143,7 @@ def _seam_notes(seams: IntArray) -> list[str]:
 def _without_other_parts(shapes: NumberedShapes, parts: list[MeshPart]) -> tuple[NumberedShapes, list[MeshPart]]:
     """Leave out the faces that are in none of the parts; return the shapes, and the parts with new numbers of faces."""
     chosen = np.sort(np.concatenate([part.faces for part in parts]))
-    renumbered = [MeshPart(part.name, np.searchsorted(chosen, part.faces)) for part in parts]
+    renumbered = [part._replace(faces=np.searchsorted(chosen, part.faces)) for part in parts]
     return shapes.only(shapes.faces[chosen]), renumbered
 
 

@@ -13,7 +13,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import face_areas
 from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.large_arrays import stacked
-from shapespace.training.collection.parts import MeshPart
+from shapespace.training.collection.parts import MeshPart, PartSize
 from shapespace.training.collection.warnings import CollectionWarning
 
 
@@ -34,6 +34,8 @@ class MeshCollection:
     places: tuple[tuple[str, int], ...] = ()
     # If there are several, the shell and then the attached parts. Edges join the faces of one part.
     parts: tuple[MeshPart, ...] = ()
+    part_sizes: tuple[PartSize, ...] = ()  # of all parts that the files have, if there are several
+    kept_alone: str | None = None  # own name of the part that is kept alone because not all can be kept
 
     @property
     def shell_faces(self) -> IntArray:

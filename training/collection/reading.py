@@ -183,9 +183,10 @@ def _pose_notes(paths: Sequence[Path]) -> list[str]:
     posed = [path.name for path in paths if extension(path) in ("glb", "gltf") and can_be_posed(path)]
     if not posed:
         return []
+    more = f" and {len(posed) - 3} more" if len(posed) > 3 else ""
     sentence = (
-        f"{', '.join(posed[:3])}{f' and {len(posed) - 3} more' if len(posed) > 3 else ''}: with sliders (morph targets) "
-        "or joints (a skin); one shape is read from each file, as its sliders and joints stand there"
+        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); one shape is read from each file, "
+        "as its sliders and joints stand there"
     )
     return [sentence]
 

@@ -14,7 +14,7 @@ import trimesh
 from shapespace.mesh.attributes import Labels
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.appearance import reference_surface
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.init import configuration
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
