@@ -24,7 +24,7 @@ from shapespace.training.collection.checks import (
 from shapespace.training.collection.faults import Faults, IngestError
 from shapespace.training.collection.listing import MIN_SHAPES
 from shapespace.training.collection.mesh_collection import MeshCollection
-from shapespace.training.collection.parts import MeshPart, parts_note, select_parts
+from shapespace.training.collection.parts import MeshPart, PartSelection, parts_note, select_parts
 from shapespace.training.collection.reading import FileShapes, read_shapes
 from shapespace.training.collection.warnings import CollectionWarning, Placements, find_warnings
 from shapespace.training.collection.welding import (
@@ -67,10 +67,10 @@ def read_collection(
 
 
 def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Faults, *, alone: bool) -> MeshCollection:
-    """Make a collection of the valid shapes, and add the faults of the others.
+    """Make a collection of the valid shapes, and add all faults that are found on the way.
 
     Raises:
-        IngestError: the valid shapes can't be used, or are too few beside others that have faults.
+        IngestError: nothing more can be checked.
     """
     source = files.sources[0]
     given = NumberedShapes.from_files(files.vertices, files.faces)
@@ -89,7 +89,9 @@ def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Fault
         seams = find_open_seams(shapes)
     notes = [*files.notes, *_welding_notes(files, given, shapes, coincidences)]
 
-    selection = select_parts(files, wanted, shapes, coincidences.shares, seams, alone=alone)
+    selection = PartSelection([], [], [])
+    with faults.gathered():
+        selection = select_parts(files, wanted, shapes, coincidences.shares, seams, alone=alone)
     parts = selection.kept
     if parts:
         notes.append(parts_note(selection))
@@ -97,7 +99,8 @@ def _checked(path: Path, files: FileShapes, wanted: Sequence[str], faults: Fault
         shapes, parts = _without_other_parts(shapes, parts)
     notes += _seam_notes(seams)
     shell = shapes.faces[parts[0].faces] if parts else shapes.faces
-    notes += orientation_notes(files.sources, shapes.vertices, shell)
+    with faults.gathered():
+        notes += orientation_notes(files.sources, shapes.vertices, shell)
     placements = Placements(shapes.vertices)
     return MeshCollection(
         names=tuple(source.name for source in files.sources),

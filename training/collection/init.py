@@ -57,8 +57,8 @@ licence = "unspecified"    # of the meshes, and so of the model: say it before y
 
 #: What a configuration says where not all parts can be kept.
 _PARTS_ALONE = (
-    "# Not all parts can be kept, so this is the largest alone; of equally large ones, the first in the file. Name another",
-    "# for a model of it, or several: up to a hundred small parts, or parts that keep their form, can be attached to one.",
+    "# Not all parts can be kept, so this is the largest alone; of equally large ones, the first in the file.",
+    "# Name another for a model of it, or several: up to a hundred parts that are small or rigid can be attached.",
 )
 
 
@@ -90,9 +90,7 @@ def configuration(
         other=_string(collection.names[0]),
         coarse=coarse,
         parts=_parts(collection, parts),
-        file=f"file = {_string(file)}    # read from each folder in data; shapes have the folders' names\n"
-        if file
-        else "",
+        file=f"file = {_string(file)}    # read from each folder in data, whose name the shape has\n" if file else "",
         material=MaterialSettings(),
         most=count - 1,
         mode=ModeSettings(),
@@ -114,11 +112,11 @@ def _parts(collection: MeshCollection, chosen: Sequence[str]) -> str:
     names = ", ".join(_string(name) for name in kept or every)
     what = "the model computes with the first; others named here are attached to it, the rest is left out"
     lines = [f"{'' if kept else '# '}parts = [{names}]    # {what}", *_PARTS_ALONE[: 2 * bool(collection.kept_alone)]]
-    lines.append("# All parts, with their vertices and their share of the area:")
+    lines.append("# All parts, with their shares of the area:")
     quoted = [_string(size.own) for size in collection.part_sizes]
     width = max(map(len, quoted))
     sizes = zip(quoted, collection.part_sizes, strict=True)
-    lines += [f"#   {name:{width}} {size.vertices:8} {size.area:8.1%}" for name, size in sizes]
+    lines += [f"#   {name:{width}} {size.vertices:8} vertices {size.area:8.1%}" for name, size in sizes]
     return "\n" + "\n".join(lines)
 
 

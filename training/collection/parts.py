@@ -91,7 +91,7 @@ def select_parts(
         shapes: the welded shapes.
         welded: (n,) share of the first shape's coinciding pairs of vertices that coincide in each shape.
         seams: (k, 2) pairs of vertices on borders that almost coincide.
-        alone: whether the largest part is kept alone where no part is wanted by name and not all can be kept. Of equally
+        alone: whether the largest part is kept alone, where none is wanted by name and not all can be kept. Of equally
             large ones this is the first in the file.
 
     Raises:
@@ -149,7 +149,9 @@ def _check_triangle_order(files: FileShapes, welded: FloatArray) -> None:
 def _check_part_order(files: FileShapes) -> Path | None:
     """Return the first file that can name parts, if any; refuse files that list the same parts in another order."""
     template = next((path for path in files.paths if may_have_names(path)), None)
-    odd = [(path, reordered(path, template)) for path in files.paths if template and path != template]
+    if template is None:
+        return None
+    odd = [(path, reordered(path, template)) for path in files.paths if path != template]
     faults = [
         Fault(str(path), f"{why}, unlike those of {template.name}", "export it like the others")
         for path, why in odd

@@ -126,7 +126,7 @@ def _read_like_one(found: MeshFiles, candidates: Sequence[int]) -> tuple[FileSha
             yield shape
 
     array = stacked(len(found.paths), shapes())[: len(kept)]
-    sources, paths = (tuple(each[k] for k in kept) for each in (found.sources, found.paths))
+    sources, paths = tuple(found.sources[k] for k in kept), tuple(found.paths[k] for k in kept)
     return FileShapes(sources, array, faces, paths, all(stl[k] for k in kept), faults=tuple(faults.found)), unlike
 
 
@@ -185,8 +185,8 @@ def _pose_notes(paths: Sequence[Path]) -> list[str]:
         return []
     more = f" and {len(posed) - 3} more" if len(posed) > 3 else ""
     sentence = (
-        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); one shape is read from each file, "
-        "as its sliders and joints stand there"
+        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); one shape is read from each "
+        "file, as its sliders and joints stand there"
     )
     return [sentence]
 

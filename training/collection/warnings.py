@@ -88,8 +88,8 @@ class Placements:
         """Find shapes that a reflection brings closer to most others than any rigid motion does."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = self._distances(-1) / self.distances
-        np.fill_diagonal(ratio, np.inf)
-        return np.flatnonzero(np.quantile(ratio, 0.6, axis=1) < THRESHOLDS.mirrored).tolist()
+            np.fill_diagonal(ratio, np.inf)
+            return np.flatnonzero(np.quantile(ratio, 0.6, axis=1) < THRESHOLDS.mirrored).tolist()
 
     def turned(self) -> dict[int, FloatArray]:
         """Find shapes whose axes are exchanged, if most shapes have the same orientation.
