@@ -106,7 +106,7 @@ def select_parts(
     parts = [MeshPart(*each) for each in zip(names, apart, _own_names(names), strict=True)]
     areas = _areas(parts, shapes)
     why = ""
-    with refusing(files.sources[0]):
+    with refusing(files.sources[0], remedy=""):
         try:
             kept = _choose(parts, wanted, shapes, areas)
         except MeshError as error:
@@ -208,7 +208,7 @@ def _choose(
             raise MeshError(
                 f"has {len(kept)} separate parts, of which {_sized(part)} is too large to be attached to "
                 f"{_sized(shell)}: it has {share:.0%} of the area and changes its form, and lengths and angles don't "
-                'see how two surfaces lie to each other. Train one model each, as by collection.parts = ["NAME"], or '
+                'see how two surfaces lie to each other; train one model each, as by collection.parts = ["NAME"], or '
                 "join them in all meshes"
             )
     return [shell, *attached]
