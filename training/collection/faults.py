@@ -1,4 +1,4 @@
-"""Faults of a collection's files: each has a file, what is wrong and what to do. All are told at once."""
+"""Faults of a collection's files: each has a file, what is wrong and what to do. One error has all of them."""
 
 from __future__ import annotations
 

@@ -70,9 +70,9 @@ class MeshCollection:
         found = []
         for warning in self.warnings:
             if warning.grave:
-                place, _, sentence = warning.sentence.partition(": ")
-                accept = f"correct it, or take it as it is, with run --accept {shlex.quote(self.names[warning.shape])}"
-                found.append(Fault(place, sentence.partition("; ")[0], accept))
+                fault = Fault.of(*warning.sentence.split(": ", 1), remedy="correct it")
+                accept = f"or take it with run --accept {shlex.quote(self.names[warning.shape])}"
+                found.append(fault._replace(remedy=f"{fault.remedy} ({accept})"))
         return found
 
 

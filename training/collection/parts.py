@@ -30,7 +30,7 @@ class MeshPart(NamedTuple):
 
 
 class PartSize(NamedTuple):
-    """The size of a part, for whoever chooses among parts."""
+    """The size of a part, which helps to choose among parts."""
 
     own: str  # see MeshPart
     vertices: int

@@ -252,6 +252,50 @@ def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said
     assert "bar3.obj: is of another size" in page(Record(RunDirectory(place / "runs" / "bars")))
 
 
+def test_one_folder_per_subject_is_read_from_init_to_report(place: Path, said: Said) -> None:
+    study = place / "study"
+    for k, shape in enumerate(SHAPES):
+        (study / f"sub-{k:02}").mkdir(parents=True)
+        write(study / f"sub-{k:02}" / "body.obj", shape)
+    (study / "dataset.json").touch()
+    (study / "sub-03" / "notes.txt").touch()
+    refused = said("init", "study", code=1)
+    assert "study: has no meshes, but its folders have; read one file from each folder" in refused
+    assert "--file 'body.obj'" in refused
+    words = said("init", "study", "--file", "body.obj")
+    notes = (
+        "left out, as only body.obj is read from each folder: notes.txt",
+        "left out, as they are not in a subject's folder: dataset.json",
+    )
+    assert all(f"  {note}\n" in words for note in notes)
+    run = "run", "study.toml", "--until", "ingest"
+    words = said(*run)
+    assert all(f"  {note}\n" in words for note in notes)
+    assert all(note.replace("'", "&#39;") in page(Record(RunDirectory(place / "runs" / "study"))) for note in notes)
+    with np.load(place / "runs" / "study" / "shapes.npz") as file:
+        assert file["names"].tolist()[:6] == [f"sub-{k:02}" for k in range(6)]
+        assert file["files"].tolist()[2] == "sub-02/body.obj"
+    assert "ingest: done before" in said(*run)
+    write(study / "sub-01" / "body.obj", SHAPES[1] * [1, 1.1, 1])
+    assert "data: 1 changed (sub-01/body.obj)" in said(*run)
+
+
+def test_all_faults_of_a_folder_are_one_table(place: Path, said: Said) -> None:
+    meshes = place / "meshes"
+    (meshes / "bar1.obj").write_text("")
+    write(meshes / "bar2.obj", 1000 * SHAPES[2])
+    write(meshes / "bar5.obj", SHAPES[5])
+    for command_line in (("init", "meshes"), ("run", "bars.toml", "--until", "ingest")):
+        said(*command_line, code=1)
+        head, columns, *rows = said.errors.splitlines()
+        assert head == "shapespace-train: the meshes have 2 faults:"
+        assert columns.split() == ["file", "what", "is", "wrong", "what", "to", "do"]
+        assert [Path(row.split()[0]).name for row in rows] == ["bar1.obj", "bar2.obj"]
+        assert re.search("has no faces  +export it again, or leave it out$", rows[0])
+        assert re.search(r"is of another size: .* median's  +is it in another unit\? .* --accept bar2\)$", rows[1])
+    assert not (place / "meshes.toml").exists()
+
+
 def done_up_to_modes(place: Path, said: Said) -> Path:
     said("run", "bars.toml", "--until", "modes")
     return place / "runs" / "bars"
