@@ -70,7 +70,8 @@ class MeshCollection:
         found = []
         for warning in self.warnings:
             if warning.grave:
-                fault = Fault.of(*warning.sentence.split(": ", 1), remedy="correct it")
+                place, _, sentence = warning.sentence.partition(": ")
+                fault = Fault.of(place, sentence, "correct it")
                 accept = f"or take it with run --accept {shlex.quote(self.names[warning.shape])}"
                 found.append(fault._replace(remedy=f"{fault.remedy} ({accept})"))
         return found
