@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
+
+from shapespace.files.archives import natural_order
 
 #: Most characters to which a column of the table is filled up.
 _WIDEST = 100
@@ -33,7 +34,7 @@ class Fault(NamedTuple):
     @property
     def sentence(self) -> str:
         """The fault in one line."""
-        line = f"{self.place}: {self.what}" if self.place else self.what
+        line = f"{shown(self.place)}: {self.what}" if self.place else self.what
         return f"{line}; {self.remedy}" if self.remedy else line
 
 
@@ -73,14 +74,13 @@ class Faults:
             raise IngestError(*sorted(dict.fromkeys(self.found), key=lambda fault: natural_order(fault.place)))
 
 
-def natural_order(text: str) -> tuple[list[str | int], str]:
-    """Key that sorts names by their words and numbers: pose2 before pose10."""
-    pieces = re.split(r"(\d+)", text.casefold())
-    return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)], text
+def shown(name: str) -> str:
+    """Return the name of a file on one line, with escapes for characters that can't be printed."""
+    return name if name.isprintable() else ascii(name)[1:-1]
 
 
 def _table(faults: tuple[Fault, ...]) -> str:
-    rows = [("file", "what is wrong", "what to do"), *faults]
+    rows = [("file", "what is wrong", "what to do"), *((shown(place), *rest) for place, *rest in faults)]
     widths = [min(max(len(row[k]) for row in rows), _WIDEST) for k in range(2)]
     lines = (f"  {place:{widths[0]}}  {what:{widths[1]}}  {remedy}".rstrip() for place, what, remedy in rows)
     return "\n".join([f"the meshes have {len(faults)} faults:", *lines])

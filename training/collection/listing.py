@@ -7,9 +7,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from shapespace.files.archives import natural_order
 from shapespace.files.reading import READ_FORMATS
 from shapespace.training.collection.checks import ShapeSource
-from shapespace.training.collection.faults import Fault, IngestError, natural_order
+from shapespace.training.collection.faults import Fault, IngestError, shown
 
 #: With fewer shapes a mean and modes say nothing about a collection.
 MIN_SHAPES = 3
@@ -96,7 +97,7 @@ def _visible(folder: Path) -> Iterable[Path]:
 
 def _flat(folder: Path) -> MeshFiles:
     """List the mesh files of a folder itself; of files with one name the first counts."""
-    every = sorted(folder.iterdir(), key=lambda path: (*natural_order(path.stem), path.name))
+    every = sorted(folder.iterdir(), key=lambda path: (natural_order(path.stem), path.name))
     files = [path for path in every if not path.name.startswith(".") and not path.is_dir()]
     first: dict[str, Path] = {}
     faults = []
@@ -211,6 +212,5 @@ def _left_out(why: str, names: list[str]) -> str:
     """Return a sentence on files that are left out for one reason; empty if there are none."""
     if not names:
         return ""
-    shown = [name if name.isprintable() else ascii(name)[1:-1] for name in names[:_MOST_NAMES]]
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"left out, as {why}: {', '.join(shown)}{more}"
+    return f"left out, as {why}: {', '.join(map(shown, names[:_MOST_NAMES]))}{more}"

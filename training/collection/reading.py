@@ -196,9 +196,11 @@ def _unfinished(path: Path) -> str:
     if extension(path) != "obj" or not path.is_file():
         return ""
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 1))
-        last = file.read()
-    return "" if last in (b"\n", b"\r", b"") else "its last line has no end: if the file is cut short, copy it again"
+        file.seek(max(0, path.stat().st_size - 200))
+        last = file.read().decode(errors="replace")
+    if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
+        return ""
+    return "its last line has no end: if the file is cut short, copy it again"
 
 
 def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int, others: IntArray) -> None:

@@ -225,3 +225,13 @@ def test_sliders_and_joints_that_are_left_as_they_stand_are_told_in_one_line(tmp
     np.testing.assert_allclose(collection.vertices[4], 1.5 * ball(4), atol=1e-6)
     (note,) = collection.notes
     assert note.startswith("pose3.glb, pose4.glb: with sliders (morph targets) or joints")
+
+
+def test_names_of_files_that_break_lines_do_not_break_the_table(tmp_path: Path) -> None:
+    folder = balls(tmp_path / "meshes")
+    for name in ("a\nb.obj", "c\x1b.obj"):
+        (folder / name).touch()
+    with pytest.raises(IngestError) as refusal:
+        read_collection(folder)
+    _, _, *rows = str(refusal.value).splitlines()
+    assert [row.split("  ")[1].rpartition("/")[2] for row in rows] == ["a\\nb.obj", "c\\x1b.obj"]
