@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -79,6 +81,10 @@ def mesh_files(folder: Path, file: str | None = None) -> MeshFiles:
         IngestError: there are fewer than 3 shapes.
     """
     found = _subjects(folder, file) if file else _flat(folder)
+    # Python has surrogates for bytes that are no text.
+    unnamed = [each.label for each in found.sources if re.search("[\ud800-\udfff]", each.label)]
+    if unnamed:
+        raise IngestError(*(Fault(path, "its name is no text in UTF-8", "rename it") for path in unnamed))
     if len(found.paths) < MIN_SHAPES:
         if hint := "" if file else _nested(folder):
             raise IngestError(Fault(str(folder), f"has {len(found.paths) or 'no'} meshes, but its folders have", hint))
@@ -190,10 +196,10 @@ def _nested(folder: Path) -> str:
         names.update(meshes | {name.replace(subject.name, "*") for name in meshes})
     if not names:
         return ""
-    name, count = max(names.items(), key=lambda item: (item[1], "*" not in item[0]))
+    file, count = max(names.items(), key=lambda item: (item[1], "*" not in item[0]))
     return (
-        f"read one file from each folder, as by init {folder} --file '{name}' ({count} folders have it), or by file in "
-        "[collection] of a configuration"
+        f"read one file from each folder, as by init {shlex.quote(str(folder))} --file {shlex.quote(file)} ({count} "
+        "folders have it), or by file in [collection] of a configuration"
     )
 
 

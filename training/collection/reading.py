@@ -173,9 +173,11 @@ def _read_mesh(source: ShapeSource, *, finite: bool = True) -> tuple[FloatArray,
     path = Path(source.label)
     remedy = _unfinished(path) or "export it again, or leave it out"
     with refusing(source, remedy=remedy):
-        arrays = mesh_arrays(*read_arrays(path), finite=False)
-    with refusing(source, remedy=_NOT_FINITE):
-        return mesh_arrays(*arrays, finite=finite)
+        vertices, faces = mesh_arrays(*read_arrays(path), finite=False)
+    if finite:
+        with refusing(source, remedy=_NOT_FINITE):
+            check_finite(vertices)
+    return vertices, faces
 
 
 def _pose_notes(paths: Sequence[Path]) -> list[str]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -148,7 +150,7 @@ def test_a_folder_of_subjects_alone_is_refused_with_the_argument_that_reads_it(
     names: str, file: str, tmp_path: Path
 ) -> None:
     study = balls(tmp_path / "study", names, 4)
-    with pytest.raises(IngestError, match=re.escape(f"--file '{file}' (4 folders have it)")):
+    with pytest.raises(IngestError, match=re.escape(f"--file {shlex.quote(file)} (4 folders have it)")):
         read_collection(study)
     assert len(read_collection(study, file=file).names) == 4
 
@@ -156,7 +158,7 @@ def test_a_folder_of_subjects_alone_is_refused_with_the_argument_that_reads_it(
 @pytest.mark.parametrize(
     ("file", "says"),
     [
-        ("none.ply", r"none of its folders has a file none\.ply; .*--file 'mesh\.obj'"),
+        ("none.ply", r"none of its folders has a file none\.ply; .*--file mesh\.obj"),
         ("mesh.fbx", r"the format of 'mesh\.fbx' is not read; these are: glb, "),
         ("../mesh.obj", r"is no path within a folder"),
         ("/mesh.obj", r"is no path within a folder"),
@@ -235,3 +237,10 @@ def test_names_of_files_that_break_lines_do_not_break_the_table(tmp_path: Path) 
         read_collection(folder)
     _, _, *rows = str(refusal.value).splitlines()
     assert [row.split("  ")[1].rpartition("/")[2] for row in rows] == ["a\\nb.obj", "c\\x1b.obj"]
+
+
+def test_a_file_whose_name_is_no_text_is_a_fault(tmp_path: Path) -> None:
+    folder = balls(tmp_path / "meshes")
+    (folder / os.fsdecode(b"pose\xff.obj")).touch()
+    with pytest.raises(IngestError, match=r"pose\\udcff\.obj: its name is no text in UTF-8; rename it"):
+        read_collection(folder)
