@@ -57,21 +57,24 @@ class ShapeSource:
 
 
 @contextmanager
-def refusing(source: ShapeSource, numbers: IntArray | None = None, remedy: str = "export it again") -> Iterator[None]:
+def refusing(
+    source: ShapeSource, numbers: IntArray | None = None, remedy: str = "export it again", *, always: bool = False
+) -> Iterator[None]:
     """Turn a MeshError into an IngestError about a file.
 
     Args:
         source: the shape that is checked.
         numbers: (V,) index that the file gives each vertex; the same one if left out.
         remedy: what to do, unless the error says it.
+        always: whether the remedy is added to what the error says.
     """
     try:
         yield
     except PlaceError as error:
-        fault = Fault.of(source.label, error.numbered(source.first, numbers), remedy)
+        fault = Fault.of(source.label, error.numbered(source.first, numbers), remedy, always=always)
         raise IngestError(fault._replace(what=fault.what + source.counted)) from error
     except MeshError as error:
-        raise IngestError(Fault.of(source.label, str(error), remedy)) from error
+        raise IngestError(Fault.of(source.label, str(error), remedy, always=always)) from error
 
 
 def mesh_arrays(vertices: np.ndarray, faces: np.ndarray, *, finite: bool = True) -> tuple[FloatArray, IntArray]:
@@ -150,7 +153,7 @@ def check_meshes(
     Raises:
         IngestError: the faces form no oriented manifold.
     """
-    with refusing(sources[0], numbers, "correct the surface there, in all files alike"):
+    with refusing(sources[0], numbers, "correct the surface there, in all files", always=True):
         connectivity = Connectivity(faces, vertices.shape[1])
     valid = []
     for k, (source, shape) in enumerate(zip(sources, vertices, strict=True)):

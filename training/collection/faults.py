@@ -20,16 +20,17 @@ class Fault(NamedTuple):
     remedy: str = ""
 
     @classmethod
-    def of(cls, place: str, sentence: str, remedy: str = "") -> Fault:
+    def of(cls, place: str, sentence: str, remedy: str = "", *, always: bool = False) -> Fault:
         """Split a sentence at its first semicolon, after which it says what to do.
 
         Args:
             place: see Fault.
             sentence: what is wrong, with or without what to do.
             remedy: what to do, where the sentence does not say it.
+            always: whether the remedy is added to what the sentence says.
         """
         what, _, own = sentence.partition("; ")
-        return cls(place, what, own or remedy)
+        return cls(place, what, f"{own}: {remedy}" if own and always else own or remedy)
 
     @property
     def sentence(self) -> str:

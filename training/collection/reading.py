@@ -146,7 +146,7 @@ def _read_like(
     path, other = Path(source.label), Path(template.label)
     try:
         _refuse_cut_short(path, len(own_vertices), own_faces, len(vertices), faces)
-        with refusing(source, remedy=f"export it like {template.file}"):
+        with refusing(source, remedy=f"export it like {template.file}", always=True):
             corners = own_vertices[own_faces]
             if triangles_only:
                 return _on_shared_vertices(corners, faces, len(vertices), template.file)
