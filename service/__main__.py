@@ -5,17 +5,49 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
-from shapespace.service.limits.process_memory import tune_malloc
-from shapespace.service.repository.validation import BundleValidator, bundle_folders
+from shapespace.command_line import USAGE, CommandParser, missing_packages
+
+if TYPE_CHECKING:
+    from shapespace.service.repository.validation import BundleValidator
 
 #: Length in characters below which a key is reported as short.
 SHORT_KEY = 16
+#: Packages of the extra ``serve`` by the names of their modules, without those that are only faster.
+NEEDED = (
+    "cachetools", "fastapi", "httptools", "onnx", "onnxruntime", "orjson", "prometheus_client", "pydantic",
+    "pydantic_settings", "python_multipart", "pythonjsonlogger", "starlette", "threadpoolctl", "trimesh", "uvicorn",
+)  # fmt: skip
 
 
-def main() -> None:
-    """Serve until SIGTERM or SIGINT, and finish running requests."""
+def parser() -> CommandParser:
+    """Return the parser of the command line, which has no arguments but ``--help`` and ``--version``."""
+    return CommandParser(
+        prog="shapespace-serve",
+        description="Serve the models of a folder over HTTP.",
+        epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT say where to listen, and "
+        "SHAPESPACE_MODELS_DIR names the folder. docs/reference/settings.md lists all.",
+        advice="Settings are environment variables, as in: SHAPESPACE_HOST=127.0.0.1 SHAPESPACE_PORT=8001 "
+        "shapespace-serve",
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Serve until SIGTERM or SIGINT, and finish running requests.
+
+    Args:
+        arguments: of the command line; by default those that the program was called with.
+    """
+    parser().parse_args(arguments)
+    if sentence := missing_packages(NEEDED, "serve"):
+        print(f"shapespace-serve: {sentence}", file=sys.stderr)
+        raise SystemExit(USAGE)
+    from shapespace.service.limits.process_memory import tune_malloc
+    from shapespace.service.repository.validation import BundleValidator
+
     tune_malloc()
     validator = BundleValidator()
     try:
@@ -28,6 +60,7 @@ def main() -> None:
 def _serve(validator: BundleValidator) -> None:
     from pydantic import ValidationError
 
+    from shapespace.service.repository.validation import bundle_folders
     from shapespace.service.settings import BUNDLED, PREFIX, Settings, is_loopback, unknown_variables
 
     try:

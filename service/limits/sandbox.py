@@ -30,6 +30,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from shapespace.files.limits import in_words
 from shapespace.service.limits.sandbox_errors import (
     ClosedError,
     DiedError,
@@ -155,7 +156,7 @@ class Sandbox:
             try:
                 child = self._idle.pop() if self._idle else _Child(TASKS[task])
             except OSError as error:
-                raise NoProcessError(f"no process can be started: {error}") from None
+                raise NoProcessError(f"no process can be started: {in_words(error)}") from None
             self._busy.add(child)
             return child
 

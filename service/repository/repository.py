@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
+from shapespace.files.limits import in_words
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.process_memory import trim_heap
 from shapespace.service.limits.sandbox_errors import (
@@ -106,7 +107,7 @@ class ModelRepository:
         try:
             folders, unreadable = bundle_folders(self._folder)
         except OSError as error:
-            logger.error("the models folder can't be read, so that nothing changes: %s", error)
+            logger.error("the models folder can't be read, so that nothing changes: %s", in_words(error))
             self._serve(self._served[0])
             return Changes(failed=True)
         changes = Changes()
@@ -137,7 +138,7 @@ class ModelRepository:
                     serve(model)
         for folder, fault in unreadable.items():
             changes.refused.append(printable(folder.name))
-            logger.error("%s can't be read, so that it stays as it was: %s", printable(folder.name), fault)
+            logger.error("%s can't be read, so that it stays as it was: %s", printable(folder.name), in_words(fault))
             for key in [key for key in before if key[0] == folder.name]:
                 serve(before.pop(key))
         for name, version in before:
@@ -262,8 +263,10 @@ def _reason(error: Exception) -> str:
     match error:
         case FailedError(kind=FailedError.UNEXPECTED) | DiedError() | LateError() | OutOfMemoryError():
             text = f"tried in a process of its own, {error}"
-        case SandboxError() | BundleError() | OSError():
+        case SandboxError() | BundleError():
             text = str(error)
+        case OSError():
+            text = in_words(error)
         case _:
             text = in_a_line(error)
     return " ".join(text.split())

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.files.limits import in_words
 from shapespace.model.decoder import Decoder
 from shapespace.service.limits.sandbox_child import raise_memory_limit
 from shapespace.service.limits.sandbox_errors import FailedError
@@ -27,6 +28,8 @@ def validate_bundle(body: bytearray, folder: str) -> tuple[JsonObject, Arrays]:
         bundle = read_bundle(Path(folder))
         raise_memory_limit(min(MEMORY_PER_VERTEX * bundle.manifest.vertices, SOLVER_MEMORY))
         Decoder(bundle).self_test()
-    except (BundleError, OSError) as error:
+    except BundleError as error:
         raise FailedError("refused", str(error)) from None
+    except OSError as error:
+        raise FailedError("refused", in_words(error)) from None
     return {"digest": bundle.digest}, {}

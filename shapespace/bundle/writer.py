@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.bundle.attributes import surface_entry
 from shapespace.bundle.geometry import Geometry
+from shapespace.bundle.reader import BundleError
 from shapespace.bundle.schema import (
     COMBINER,
     GEOMETRY,
@@ -25,6 +27,7 @@ from shapespace.bundle.schema import (
     factor_network,
 )
 from shapespace.files.atomic import replaced_folder, synced_file
+from shapespace.files.limits import clipped
 from shapespace.files.npz import npz_bytes
 from shapespace.shell.energy import Material
 
@@ -66,11 +69,39 @@ class Facts:
     draft_error: Mapping[str, float] | None = None
 
 
+def require_replaceable(folder: Path) -> None:
+    """Refuse a place for a bundle that holds anything but a bundle: writing there would delete it.
+
+    Raises:
+        BundleError: the folder has files that are not of a bundle, or is a file or a link.
+    """
+    for parent in folder.parents:
+        if parent.exists() and not parent.is_dir():
+            raise BundleError(f"{parent} is a file, and bundles lie in a folder: choose another folder for them")
+    if not os.path.lexists(folder):
+        return
+    remedy = "nothing is replaced there: move it away, or choose another folder, name or version for the bundle"
+    if folder.is_symlink() or not folder.is_dir():
+        raise BundleError(f"{folder} is no folder, so {remedy}")
+    present = {path.name for path in folder.iterdir()}
+    try:
+        own = {MANIFEST, *json.loads((folder / MANIFEST).read_bytes())["files"]} if MANIFEST in present else set()
+    except (OSError, ValueError, LookupError, TypeError):
+        own = set()
+    if others := sorted(present - own):
+        named = ", ".join(map(clipped, others[:3])) + (", …" if len(others) > 3 else "")
+        raise BundleError(f"{folder} holds {named}, which no export wrote, so {remedy}")
+
+
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:
     """Write or replace the bundle ``models/NAME/VERSION/``, and return its folder.
 
-    Equal contents give equal bytes. Raises pydantic.ValidationError if the facts contradict each other or the files;
-    then nothing is written. Raises OSError if the folder can't be written.
+    Equal contents give equal bytes.
+
+    Raises:
+        BundleError: the folder holds something else, see `require_replaceable`. Nothing is written.
+        pydantic.ValidationError: the facts contradict each other or the files. Nothing is written.
+        OSError: the folder can't be written.
     """
     files = {factor_network(j).file: content for j, content in enumerate(networks.factors)}
     files |= {COMBINER.file: networks.combiner, GEOMETRY.file: npz_bytes(geometry.arrays(), compressed=False)}
@@ -82,6 +113,7 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
 
     folder = models / facts.name / facts.version
+    require_replaceable(folder)
     with replaced_folder(folder) as part:
         for name, content in (files | {MANIFEST: text.encode()}).items():
             with synced_file(part / name) as file:

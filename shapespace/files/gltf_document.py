@@ -44,6 +44,16 @@ def read_document(data: memoryview, *, binary: bool, beside: Path | None) -> tup
     return document, Buffers(document.buffers, chunk, uris, beside)
 
 
+def can_be_posed(path: Path) -> bool:
+    """Whether a file has morph targets or skins, so that it describes more shapes than one; False if it is damaged."""
+    try:
+        document, _ = read_document(memoryview(path.read_bytes()), binary=path.suffix.lower() == ".glb", beside=None)
+        primitives = (primitive for mesh in document.meshes for primitive in objects(mesh, "primitives"))
+        return any("skin" in node for node in document.nodes) or any(each.get("targets") for each in primitives)
+    except Exception:  # the readers of the mesh say what is wrong
+        return False
+
+
 def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
     """Split a GLB file into its JSON and its data (4.4)."""
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)

@@ -1,7 +1,8 @@
-"""Limits on the size of a mesh, and text from files: its encoding, and how messages quote it."""
+"""Limits on the size of a mesh, text from files (its encoding, and how messages quote it), and errors of the system."""
 
 from __future__ import annotations
 
+import errno
 import re
 import sys
 from dataclasses import dataclass
@@ -70,3 +71,28 @@ def clipped(text: object, most: int = 100) -> str:
     """Return text from a file on one line, shortened to ``most`` characters."""
     line = " ".join(str(text)[:1000].split())
     return line if len(line) <= most else f"{line[:most]}…"
+
+
+#: Sentences about a file or folder, by the number of the system's error.
+_SYSTEM_ERRORS = {
+    errno.ENOENT: "there is no such file or folder; check its name",
+    errno.EISDIR: "it is a folder, where a file is needed",
+    errno.ENOTDIR: "it is a file or lies below one, where a folder is needed",
+    errno.EACCES: "you may not read or write there; change its permissions, or choose another place",
+    errno.EPERM: "you may not read or write there; change its permissions, or choose another place",
+    errno.EROFS: "the disk can't be written to; choose another place",
+    errno.ENOSPC: "the disk is full; make room, then give the same command again",
+    errno.EDQUOT: "the disk is full for this user; make room, then give the same command again",
+    errno.ENAMETOOLONG: "its name is too long; choose a shorter one",
+    errno.ELOOP: "its links lead back to themselves; name the file itself",
+    errno.EMFILE: "too many files are open at once; raise the limit with ulimit -n",
+}
+
+
+def in_words(error: OSError, *, named: bool = True) -> str:
+    """Return what the system refused and what to do, without the error's number.
+
+    With ``named`` the sentence begins with the file, if the error has one.
+    """
+    words = _SYSTEM_ERRORS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+    return f"{error.filename}: {words}" if named and error.filename is not None else words

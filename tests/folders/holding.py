@@ -80,7 +80,7 @@ def hold(folder: Folder, place: Path) -> str:
 
 def sound(folder: Folder, place: Path, data: Path, *, may_fold: bool) -> str:
     """Check shapes that the bundle decodes and training shapes that it encodes; return errors in words."""
-    model = ShapeModel(read_bundle(place / "models" / "figure" / "2"))
+    model = ShapeModel(read_bundle(place / "models" / "figure" / "1"))
     faces = Connectivity(model.reference.faces, len(model.reference.vertices))
     left, right = faces.edge_faces[faces.interior].T
 

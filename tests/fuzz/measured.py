@@ -139,7 +139,7 @@ def main() -> None:
     # Imported after the meter is installed, so that all of it is measured.
     from shapespace.service.__main__ import main as serve
 
-    serve()
+    serve([])
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_files
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle
@@ -98,10 +98,11 @@ JSON = st.recursive(
 
 
 def one_line(error: Exception) -> None:
-    text = str(error)
-    assert text
-    assert "\n" not in text
-    assert len(text) < 1000, text
+    """Each fault is one line; a table has several."""
+    for text in [fault.sentence for fault in error.faults] if isinstance(error, IngestError) else [str(error)]:
+        assert text
+        assert "\n" not in text
+        assert len(text) < 1000, text
 
 
 @contextmanager

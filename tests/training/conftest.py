@@ -171,6 +171,7 @@ class Said:
         captured = self._capsys.readouterr()
         self.errors = captured.err
         assert "Traceback" not in captured.err
+        assert "Errno" not in captured.err
         return captured.out + captured.err
 
 

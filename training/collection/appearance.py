@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.files.attributes.reading import FORMATS, read_attributes
+from shapespace.files.limits import in_words
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.training.collection.listing import data_files
 from shapespace.training.collection.mesh_collection import MeshCollection
-from shapespace.training.collection.reading import data_files
 
 
 def reference_surface(
@@ -36,7 +37,8 @@ def reference_surface(
             found = found.welded(meshes.file_vertices)
             found.check(meshes.vertices.shape[1], meshes.faces)
     except (OSError, MeshError) as error:
-        found, faults = None, [f"its polygons, texture coordinates and materials are left out: {error}"]
+        why = in_words(error, named=False) if isinstance(error, OSError) else error
+        found, faults = None, [f"its polygons, texture coordinates and materials are left out: {why}"]
     return found, [f"{path}: {fault}" for fault in faults]
 
 

@@ -12,13 +12,10 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, PlaceError, TriangleMesh, diagonal, face_areas
+from shapespace.training.collection.faults import Fault, Faults, IngestError
 
 #: A volume below this share of area^(3/2) is too small to tell inside from outside; a ball has 0.094.
 CLEAR_VOLUME = 1e-3
-
-
-class IngestError(ValueError):
-    """A collection that can't be used: one line with the file, the fault and, where there is one, the remedy."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +37,18 @@ class ShapeSource:
     name: str  # the shape's name
     # Number that the file gives to its first vertex and its first face: 1 in OBJ, 0 in all other formats.
     first: int = 0
+    folder: Path | None = None  # folder of the collection, if each shape has a folder in it
 
     @classmethod
-    def of_file(cls, path: Path) -> ShapeSource:
-        """Return the source of a shape that has a file of its own."""
-        return cls(str(path), path.stem, int(path.suffix.lower() == ".obj"))
+    def of_file(cls, path: Path, folder: Path | None = None) -> ShapeSource:
+        """Return the source of a shape with its own file, or with its own folder in the collection's."""
+        name = path.relative_to(folder).parts[0] if folder else path.stem
+        return cls(str(path), name, int(path.suffix.lower() == ".obj"), folder)
 
     @property
     def file(self) -> str:
-        """The label without the folder."""
-        return Path(self.label).name
+        """The label without the collection's folder."""
+        return Path(self.label).relative_to(self.folder).as_posix() if self.folder else Path(self.label).name
 
     @property
     def counted(self) -> str:
@@ -58,23 +57,33 @@ class ShapeSource:
 
 
 @contextmanager
-def refusing(source: ShapeSource, numbers: IntArray | None = None) -> Iterator[None]:
+def refusing(
+    source: ShapeSource, numbers: IntArray | None = None, remedy: str = "export it again", *, always: bool = False
+) -> Iterator[None]:
     """Turn a MeshError into an IngestError about a file.
 
     Args:
         source: the shape that is checked.
         numbers: (V,) index that the file gives each vertex; the same one if left out.
+        remedy: what to do, unless the error says it.
+        always: whether the remedy is added to what the error says.
     """
     try:
         yield
     except PlaceError as error:
-        raise IngestError(f"{source.label}: {error.numbered(source.first, numbers)}{source.counted}") from error
+        fault = Fault.of(source.label, error.numbered(source.first, numbers), remedy, always=always)
+        raise IngestError(fault._replace(what=fault.what + source.counted)) from error
     except MeshError as error:
-        raise IngestError(f"{source.label}: {error}") from error
+        raise IngestError(Fault.of(source.label, str(error), remedy, always=always)) from error
 
 
-def mesh_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, IntArray]:
+def mesh_arrays(vertices: np.ndarray, faces: np.ndarray, *, finite: bool = True) -> tuple[FloatArray, IntArray]:
     """Check the arrays of one mesh and return them as float64 and int64.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        finite: whether coordinates are checked too, as by `check_finite`.
 
     Raises:
         MeshError: a wrong shape or type, no faces, a vertex number out of range, or a coordinate that isn't finite.
@@ -92,10 +101,17 @@ def mesh_arrays(vertices: np.ndarray, faces: np.ndarray) -> tuple[FloatArray, In
     if faces.min() < 0 or faces.max() >= len(vertices):
         sentence = f"faces name vertices {{lowest}} to {{highest}}, but there are {len(vertices)} vertices"
         raise PlaceError(sentence, {"lowest": [int(faces.min())], "highest": [int(faces.max())]})
+    if finite:
+        check_finite(vertices)
+    return vertices.astype(np.float64), faces.astype(np.int64)
+
+
+def check_finite(vertices: np.ndarray) -> None:
+    """Raise MeshError if a coordinate of the vertices (V, 3) isn't finite."""
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
-        raise PlaceError("vertex {vertex} has a coordinate that is not finite", {"vertex": [int(bad[0])]})
-    return vertices.astype(np.float64), faces.astype(np.int64)
+        sentence = "vertex {vertex} has a coordinate that is not finite"
+        raise PlaceError(sentence, {"vertex": [int(bad[0])]})
 
 
 #: Exporters split vertices where normals or texture coordinates differ.
@@ -126,17 +142,25 @@ def same_connectivity(
         )
 
 
-def check_meshes(sources: Sequence[ShapeSource], vertices: FloatArray, faces: IntArray, numbers: IntArray) -> None:
+def check_meshes(
+    sources: Sequence[ShapeSource], vertices: FloatArray, faces: IntArray, numbers: IntArray, faults: Faults
+) -> list[int]:
     """Check that shapes (n, V, 3), each vertex in a face (F, 3), are valid meshes; ``numbers`` (V,) are the files'.
 
+    Returns:
+        Indices of the valid shapes. A face without area is among the faults of the others.
+
     Raises:
-        IngestError: the faces form no oriented manifold, or a face of a shape has no area.
+        IngestError: the faces form no oriented manifold.
     """
-    with refusing(sources[0], numbers):
+    with refusing(sources[0], numbers, "correct the surface there, in all files", always=True):
         connectivity = Connectivity(faces, vertices.shape[1])
-    for source, shape in zip(sources, vertices, strict=True):
-        with refusing(source, numbers):
+    valid = []
+    for k, (source, shape) in enumerate(zip(sources, vertices, strict=True)):
+        with faults.gathered(), refusing(source, numbers, "move its corners apart, or remove the face in all files"):
             TriangleMesh(shape, connectivity)
+            valid.append(k)
+    return valid
 
 
 def check_different(path: Path, vertices: FloatArray) -> None:
@@ -148,8 +172,11 @@ def check_different(path: Path, vertices: FloatArray) -> None:
     tolerance = TOLERANCES.weld * diagonal(vertices[0])
     if all(np.abs(align(shape, vertices[0]) - vertices[0]).max() <= tolerance for shape in vertices):
         raise IngestError(
-            f"{path}: all {len(vertices)} shapes are equal up to where they stand and how they are turned; poses and "
-            "morph targets inside a file are not read, export each shape as a mesh of its own"
+            Fault(
+                str(path),
+                f"all {len(vertices)} shapes are equal up to where they stand and how they are turned",
+                "export each shape as a mesh of its own, since animations inside a file are not read",
+            )
         )
 
 
@@ -171,8 +198,6 @@ def orientation_notes(sources: Sequence[ShapeSource], vertices: FloatArray, face
     outwards, inwards = ([k for k, side in enumerate(sides) if side == sign] for sign in (1, -1))
     if outwards and inwards:
         odd, most = sorted((outwards, inwards), key=len)
-        raise IngestError(
-            f"{sources[odd[0]].label}: is inside out, compared with {sources[most[0]].label} and most others, like a "
-            "mirror image; mirror it back"
-        )
+        what = f"is inside out, compared with {sources[most[0]].label} and most others, like a mirror image"
+        raise IngestError(*(Fault(sources[k].label, what, "mirror it back") for k in odd))
     return ["faces are wound inside out, normals point inwards; they stay so in all that is written"] if inwards else []

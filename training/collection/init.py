@@ -6,8 +6,10 @@ import json
 import os
 import re
 import unicodedata
+from collections.abc import Sequence
 from pathlib import Path
 
+from shapespace.files.limits import in_words
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import ConfigError
@@ -20,7 +22,7 @@ TEMPLATE = """\
 
 [collection]
 data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; relative to this file
-# The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
+{file}# The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
 # unless another is named here, as in: reference = {other}
 {coarse}{parts}
 # mirror = true    # where a shape is symmetric, mirror images of all are learned from as well
@@ -53,13 +55,24 @@ licence = "unspecified"    # of the meshes, and so of the model: say it before y
 """
 
 
-def configuration(collection: MeshCollection, data: str, title: str) -> str:
+#: What a configuration says where not all parts can be kept.
+_PARTS_ALONE = (
+    "# Not all parts can be kept, so this is the largest alone; of equally large ones, the first in the file.",
+    "# Name another for a model of it, or several: up to a hundred parts that are small or rigid can be attached.",
+)
+
+
+def configuration(
+    collection: MeshCollection, data: str, title: str, parts: Sequence[str] = (), file: str | None = None
+) -> str:
     """Return the TOML text of a collection's configuration.
 
     Args:
         collection: the meshes.
         data: the meshes' path in the configuration.
         title: the model's title; the bundle's name is made from it.
+        parts: names of the parts to keep, if they are chosen.
+        file: name of the file that is read from each folder, if any.
     """
     count, vertices = collection.vertices.shape[:2]
     target = CollectionSettings().coarse_vertices
@@ -76,7 +89,8 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
         reference=_string(collection.names[collection.central]),
         other=_string(collection.names[0]),
         coarse=coarse,
-        parts=_parts(collection),
+        parts=_parts(collection, parts),
+        file=f"file = {_string(file)}    # read from each folder in data, whose name the shape has\n" if file else "",
         material=MaterialSettings(),
         most=count - 1,
         mode=ModeSettings(),
@@ -89,15 +103,35 @@ def configuration(collection: MeshCollection, data: str, title: str) -> str:
     )
 
 
-def _parts(collection: MeshCollection) -> str:
-    if not collection.parts:
+def _parts(collection: MeshCollection, chosen: Sequence[str]) -> str:
+    """Return the setting ``parts``, active if not all are kept, and a list of all parts."""
+    if not collection.part_sizes:
         return ""
-    names = ", ".join(_string(name) for name in dict.fromkeys(part.name for part in collection.parts))
-    return f"\n# parts = [{names}]    # the model computes with the first; the others are attached to it"
+    kept = [collection.kept_alone] if collection.kept_alone else list(chosen)
+    every = list(dict.fromkeys(part.name for part in collection.parts))
+    names = ", ".join(_string(name) for name in kept or every)
+    what = "the model computes with the first; others named here are attached to it, the rest is left out"
+    lines = [f"{'' if kept else '# '}parts = [{names}]    # {what}", *_PARTS_ALONE[: 2 * bool(collection.kept_alone)]]
+    lines.append("# All parts, with their shares of the area:")
+    quoted = [_string(size.own) for size in collection.part_sizes]
+    width = max(map(len, quoted))
+    sizes = zip(quoted, collection.part_sizes, strict=True)
+    lines += [f"#   {name:{width}} {size.vertices:8} vertices {size.area:8.1%}" for name, size in sizes]
+    return "\n" + "\n".join(lines)
 
 
-def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tuple[Path, MeshCollection]:
+def write(
+    meshes: Path,
+    out: Path | None = None,
+    *,
+    force: bool = False,
+    parts: Sequence[str] = (),
+    file: str | None = None,
+) -> tuple[Path, MeshCollection]:
     """Read a collection and write its configuration, by default into the working directory under the collection's name.
+
+    Without names of ``parts``, the largest part is kept alone where not all can be kept. ``file`` is the name of the
+    file to read from each folder in ``meshes``, if any.
 
     Raises:
         IngestError: the collection can't be used.
@@ -108,12 +142,16 @@ def write(meshes: Path, out: Path | None = None, *, force: bool = False) -> tupl
     out = out or Path(f"{title}.toml")
     if out.exists() and not force:
         raise ConfigError(f"{out}: is there already; --force replaces it, --out FILE.toml writes another")
-    collection = read_collection(meshes)
+    collection = read_collection(meshes, parts, file, alone=True)
     data = Path(os.path.relpath(full, out.parent.resolve())).as_posix()
     try:
-        out.write_bytes(configuration(collection, data, title).encode())
-    except (OSError, UnicodeEncodeError) as error:
-        raise ConfigError(f"{out}: can't be written: {error}") from error
+        out.write_bytes(configuration(collection, data, title, parts, file).encode())
+    except OSError as error:
+        raise ConfigError(f"{out}: can't be written: {in_words(error, named=False)}") from error
+    except UnicodeEncodeError as error:
+        raise ConfigError(
+            f"{out}: can't be written: a name in it is no text; rename the folder or its files"
+        ) from error
     return out, collection
 
 

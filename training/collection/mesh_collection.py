@@ -11,9 +11,9 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import face_areas
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.large_arrays import stacked
-from shapespace.training.collection.parts import MeshPart
+from shapespace.training.collection.parts import MeshPart, PartSize
 from shapespace.training.collection.warnings import CollectionWarning
 
 
@@ -34,6 +34,8 @@ class MeshCollection:
     places: tuple[tuple[str, int], ...] = ()
     # If there are several, the shell and then the attached parts. Edges join the faces of one part.
     parts: tuple[MeshPart, ...] = ()
+    part_sizes: tuple[PartSize, ...] = ()  # of all parts that the files have, if there are several
+    kept_alone: str | None = None  # own name of the part that is kept alone because not all can be kept
 
     @property
     def shell_faces(self) -> IntArray:
@@ -43,7 +45,7 @@ class MeshCollection:
     def index(self, name: str | None) -> int:
         """Return the index of a shape by its name, or of the most central shape for None; IngestError if unknown."""
         if name is not None and name not in self.names:
-            raise IngestError(f"no shape is called {name!r}; there are {', '.join(self.names[:8])} …")
+            raise IngestError(Fault("", f"no shape is called {name!r}", f"there are {', '.join(self.names[:8])} …"))
         return self.central if name is None else self.names.index(name)
 
     def require_accepted(self, accepted: Sequence[str]) -> None:
@@ -52,16 +54,27 @@ class MeshCollection:
         Raises:
             IngestError: with each such shape, or with a name that no shape has.
         """
-        names = {name if name in self.names else Path(name).stem for name in accepted}
+        by_file = {file: name for name, (file, _) in zip(self.names, self.places, strict=False)}
+        names = {name if name in self.names else by_file.get(name, Path(name).stem) for name in accepted}
         if unknown := names - set(self.names):
-            raise IngestError(f"--accept: no shape is called {', '.join(sorted(unknown))}")
+            raise IngestError(Fault("", f"--accept: no shape is called {', '.join(sorted(unknown))}"))
         grave = [warning for warning in self.warnings if warning.grave and self.names[warning.shape] not in names]
         if grave:
             files = " ".join(shlex.quote(self.names[warning.shape]) for warning in grave)
-            raise IngestError(
-                "\n  ".join(["these shapes would spoil the model:", *(warning.sentence for warning in grave)])
-                + f"\nMend or remove them; or take them as they are, with --accept {files}"
-            )
+            sentences = "\n  ".join(["these shapes would spoil the model:", *(warning.sentence for warning in grave)])
+            remedy = f"\nMend or remove them; or take them as they are, with --accept {files}"
+            raise IngestError(Fault("", sentences + remedy))
+
+    def grave_faults(self) -> list[Fault]:
+        """Return the grave warnings as faults."""
+        found = []
+        for warning in self.warnings:
+            if warning.grave:
+                place, _, sentence = warning.sentence.partition(": ")
+                fault = Fault.of(place, sentence, "correct it")
+                accept = f"or take it with run --accept {shlex.quote(self.names[warning.shape])}"
+                found.append(fault._replace(remedy=f"{fault.remedy} ({accept})"))
+        return found
 
 
 def normalised(collection: MeshCollection, reference: int) -> tuple[FloatArray, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,8 @@ from scipy import sparse
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, diagonal, face_areas
-from shapespace.training.collection.checks import TOLERANCES, IngestError, refusing
+from shapespace.training.collection.checks import TOLERANCES, refusing
+from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.part_names import listed, may_have_names, part_names, reordered
 from shapespace.training.collection.reading import FileShapes
 from shapespace.training.collection.welding import NumberedShapes
@@ -24,6 +26,24 @@ class MeshPart(NamedTuple):
 
     name: str  # the name of its object, group or material in the file, or "part 1" and so on
     faces: IntArray  # (k,) indices of its faces
+    own: str = ""  # a name that no other part has: ``name``, followed by a number where several parts share it
+
+
+class PartSize(NamedTuple):
+    """The size of a part, which helps to choose among parts."""
+
+    own: str  # see MeshPart
+    vertices: int
+    area: float  # share of the first shape's area
+
+
+class PartSelection(NamedTuple):
+    """The parts that a collection keeps, and all that there are."""
+
+    kept: list[MeshPart]  # the shell and then the attached parts; empty if there is one part and none is wanted by name
+    left_out: list[MeshPart]
+    sizes: list[PartSize]  # of all parts, those with the most vertices first
+    why: str = ""  # why not all are kept, where the largest one is kept alone
 
 
 @dataclass(frozen=True)
@@ -37,6 +57,7 @@ class PartLimits:
     # the vertices; a share of the part's diagonal.
     rigid: float = 0.005
     count: int = 100  # most parts: each takes time in every answer
+    equal: float = 0.999  # parts with this share of the largest area count as equally large
 
 
 LIMITS = PartLimits()
@@ -54,8 +75,14 @@ def separate(connectivity: Connectivity) -> list[IntArray]:
 
 
 def select_parts(
-    files: FileShapes, wanted: Sequence[str], shapes: NumberedShapes, welded: FloatArray, seams: IntArray
-) -> tuple[list[MeshPart], list[MeshPart]]:
+    files: FileShapes,
+    wanted: Sequence[str],
+    shapes: NumberedShapes,
+    welded: FloatArray,
+    seams: IntArray,
+    *,
+    alone: bool = False,
+) -> PartSelection:
     """Choose the shell and the attached parts.
 
     Args:
@@ -64,10 +91,8 @@ def select_parts(
         shapes: the welded shapes.
         welded: (n,) share of the first shape's coinciding pairs of vertices that coincide in each shape.
         seams: (k, 2) pairs of vertices on borders that almost coincide.
-
-    Returns:
-        The shell followed by the attached parts, and the parts left out. Both are empty if there is one part and no
-        part is wanted by name.
+        alone: whether the largest part is kept alone, where none is wanted by name and not all can be kept. Of equally
+            large ones this is the first in the file.
 
     Raises:
         IngestError: files list their faces or parts in different orders, no part has a wanted name, or a part is too
@@ -75,76 +100,115 @@ def select_parts(
     """
     apart = separate(shapes.connectivity)
     if len(apart) == 1 and not wanted:
-        return [], []
+        return PartSelection([], [], [])
     _check_triangle_order(files, welded)
     names = part_names(apart, _check_part_order(files))
-    parts = [MeshPart(name, faces) for name, faces in zip(names, apart, strict=True)]
-    with refusing(files.sources[0]):
+    parts = [MeshPart(*each) for each in zip(names, apart, _own_names(names), strict=True)]
+    areas = _areas(parts, shapes)
+    why = ""
+    with refusing(files.sources[0], remedy=""):
         try:
-            chosen = _choose(parts, wanted, shapes)
+            kept = _choose(parts, wanted, shapes, areas)
         except MeshError as error:
+            reason = str(error)
             if not wanted and (touching := _seams_between(apart, shapes, seams)):
-                raise MeshError(
+                reason = (
                     f"has {len(apart)} parts that almost meet: {touching} pairs of vertices on their borders are less "
                     f"than {TOLERANCES.seam:g} of the mesh's size apart; merge them in all meshes, or take them apart"
-                ) from error
-            raise
-    return chosen, [part for part in parts if not any(part is each for each in chosen)]
+                )
+            if wanted or not alone:
+                raise MeshError(reason) from error
+            kept, why = [_largest(parts, areas)], reason
+    whole = sum(areas.values())
+    sizes = [PartSize(part.own, len(np.unique(shapes.faces[part.faces])), areas[part.own] / whole) for part in parts]
+    left_out = [part for part in parts if not any(part is each for each in kept)]
+    return PartSelection(kept, left_out, sorted(sizes, key=lambda size: -size.vertices), why)
 
 
-def parts_note(parts: Sequence[MeshPart], left_out: Sequence[MeshPart]) -> str:
-    """Return a sentence on what becomes of the parts, the shell first."""
-    shell, *attached = parts
-    sentence = f"{len(parts) + len(left_out)} separate parts: the model computes with {_sized(shell)}"
+def parts_note(parts: PartSelection) -> str:
+    """Return a sentence on what becomes of the parts."""
+    (shell, *attached), left_out = parts.kept, parts.left_out
+    sentence = f"{len(parts.sizes)} separate parts: the model computes with {_sized(shell)}"
     if attached:
         sentence += f"; attached to it: {listed([part.name for part in attached])}"
     if left_out:
         sentence += f"; left out: {listed([part.name for part in left_out])}"
+    if parts.why:
+        sentence += f". Not all can be kept, as the mesh {parts.why}"
     return sentence
 
 
 def _check_triangle_order(files: FileShapes, welded: FloatArray) -> None:
     """Refuse STL files in different orders: corners of triangles that meet in one file don't meet in the other."""
-    odd = int(welded.argmin())
-    if files.triangles_only and welded[odd] < 0.5:
-        raise IngestError(
-            f"{files.sources[odd].label}: its triangles don't meet where those of {files.sources[0].label} do; STL "
-            "files must list the faces in the same order"
-        )
+    if files.triangles_only and (welded < 0.5).any():
+        what = f"its triangles don't meet where those of {files.sources[0].label} do"
+        remedy = "STL files must list the faces in the same order"
+        raise IngestError(*(Fault(files.sources[k].label, what, remedy) for k in np.flatnonzero(welded < 0.5)))
 
 
 def _check_part_order(files: FileShapes) -> Path | None:
     """Return the first file that can name parts, if any; refuse files that list the same parts in another order."""
     template = next((path for path in files.paths if may_have_names(path)), None)
-    for path in files.paths:
-        if template and path != template and (fault := reordered(path, template)):
-            raise IngestError(f"{path}: {fault}, unlike those of {template.name}; export it like the others")
+    if template is None:
+        return None
+    odd = [(path, reordered(path, template)) for path in files.paths if path != template]
+    faults = [
+        Fault(str(path), f"{why}, unlike those of {template.name}", "export it like the others")
+        for path, why in odd
+        if why
+    ]
+    if faults:
+        raise IngestError(*faults)
     return template
 
 
-def _choose(parts: Sequence[MeshPart], wanted: Sequence[str], shapes: NumberedShapes) -> list[MeshPart]:
-    """Return the shell and the attached parts. Raises MeshError, see `select_parts`."""
-    known = list(dict.fromkeys(part.name for part in parts))
-    for name in wanted:
-        if name not in known:
-            raise MeshError(f"has no part {name!r}, as collection.parts asks for; its parts are {listed(known)}")
-    kept = [part for part in parts if not wanted or part.name in wanted]
+def _own_names(names: Sequence[str]) -> list[str]:
+    """Number names that several parts share: "body" becomes "body 1" and "body 2"."""
+    taken, own = set(names), []
+    for name in names:
+        alone = name
+        if names.count(name) > 1:
+            alone = next(each for k in itertools.count(1) if (each := f"{name} {k}") not in taken)
+            taken.add(alone)
+        own.append(alone)
+    return own
+
+
+def _areas(parts: Sequence[MeshPart], shapes: NumberedShapes) -> dict[str, float]:
+    """Return the area of each part in the first shape, by its own name."""
     areas = face_areas(shapes.vertices[0], shapes.faces)
-    sizes = {id(part): float(areas[part.faces].sum()) for part in kept}
-    shell = max((part for part in kept if not wanted or part.name == wanted[0]), key=lambda part: sizes[id(part)])
+    return {part.own: float(areas[part.faces].sum()) for part in parts}
+
+
+def _largest(parts: Sequence[MeshPart], areas: Mapping[str, float]) -> MeshPart:
+    """Return the part with the largest area; of equally large ones the first in the file."""
+    most = max(areas[part.own] for part in parts)
+    return next(part for part in parts if areas[part.own] >= LIMITS.equal * most)
+
+
+def _choose(
+    parts: Sequence[MeshPart], wanted: Sequence[str], shapes: NumberedShapes, areas: Mapping[str, float]
+) -> list[MeshPart]:
+    """Return the shell and the attached parts. Raises MeshError, see `select_parts`."""
+    for name in wanted:
+        if not any(name in (part.name, part.own) for part in parts):
+            known = listed(list(dict.fromkeys(part.name for part in parts)))
+            raise MeshError(f"has no part {name!r}, as collection.parts asks for; its parts are {known}")
+    kept = [part for part in parts if not wanted or {part.name, part.own} & {*wanted}]
+    shell = _largest([part for part in kept if not wanted or wanted[0] in (part.name, part.own)], areas)
     attached = [part for part in kept if part is not shell]
     if len(attached) >= LIMITS.count:
         raise MeshError(
             f"has {len(kept)} separate parts, where {LIMITS.count} are allowed; join them in all meshes, or keep some "
-            "only, by collection.parts"
+            "only, by collection.parts: init lists them all"
         )
     for part in attached:
-        share = sizes[id(part)] / sizes[id(shell)]
+        share = areas[part.own] / areas[shell.own]
         if share > LIMITS.area and not _keeps_its_form(shapes.vertices, np.unique(shapes.faces[part.faces])):
             raise MeshError(
                 f"has {len(kept)} separate parts, of which {_sized(part)} is too large to be attached to "
                 f"{_sized(shell)}: it has {share:.0%} of the area and changes its form, and lengths and angles don't "
-                'see how two surfaces lie to each other. Train one model each, as by collection.parts = ["NAME"], or '
+                'see how two surfaces lie to each other; train one model each, as by collection.parts = ["NAME"], or '
                 "join them in all meshes"
             )
     return [shell, *attached]

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.archives import natural_order
+from shapespace.files.gltf_document import can_be_posed
+from shapespace.files.limits import in_words
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.reading import MORPH_FORMATS, READ_FORMATS, read_arrays, read_morph_file
 from shapespace.mesh.triangle_mesh import MeshError, PlaceError, on_shared_vertices
 from shapespace.training.collection.checks import (
     TOLERANCES,
-    IngestError,
     ShapeSource,
+    check_finite,
     mesh_arrays,
     refusing,
     same_connectivity,
 )
+from shapespace.training.collection.faults import Fault, Faults, IngestError
 from shapespace.training.collection.large_arrays import stacked
+from shapespace.training.collection.listing import MIN_SHAPES, TOO_FEW, MeshFiles, data_files, extension, mesh_files
 from shapespace.training.collection.part_names import difference
 from shapespace.training.runs.progress import progress
 
-#: With fewer shapes a mean and modes say nothing about a collection.
-MIN_SHAPES = 3
-TOO_FEW = f"has {{}} shapes; at least {MIN_SHAPES} are needed"
-
-#: Extensions of files that accompany meshes: buffers of glTF, materials of OBJ, and textures.
-_COMPANIONS = ("bin", "mtl", "png", "jpg", "jpeg")
+#: What to do about coordinates that are not finite.
+_NOT_FINITE = "correct that vertex, or leave the shape out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,150 +42,186 @@ class FileShapes:
     faces: IntArray  # (F, 3)
     paths: tuple[Path, ...] = ()  # the shapes' files; one file if its morph targets are the shapes
     triangles_only: bool = False  # whether no file says which vertices its triangles share, as in STL
+    notes: tuple[str, ...] = ()  # sentences on what is left out
+    faults: tuple[Fault, ...] = ()  # of all other shapes
+
+    def only(self, kept: Sequence[int]) -> FileShapes:
+        """Leave out all shapes but some."""
+        sources = tuple(self.sources[k] for k in kept)
+        paths = tuple(self.paths[k] for k in kept) if len(self.paths) == len(self.sources) else self.paths
+        return replace(self, sources=sources, vertices=self.vertices[list(kept)], paths=paths)
 
 
-def read_shapes(path: Path) -> FileShapes:
+def read_shapes(path: Path, file: str | None = None) -> FileShapes:
     """Read a folder of mesh files in natural order (pose2 before pose10), one NPZ, or one file of morph targets.
 
     A folder whose only mesh is a glTF file is read like that file.
 
+    Args:
+        path: the folder or file.
+        file: name of the file to read from each folder in ``path``, see `listing.mesh_files`.
+
     Raises:
-        IngestError: nothing to read, fewer than 3 shapes, an unreadable file, or files with different faces.
+        IngestError: nothing to read, fewer than 3 shapes, or no file that can be read.
     """
     if not path.exists():
-        raise IngestError(f"{path}: no such file or folder")
+        raise IngestError(Fault(str(path), "no such file or folder"))
     if not path.is_file() and not path.is_dir():
-        raise IngestError(f"{path}: is neither a file nor a folder; name the folder that holds the meshes, or one NPZ")
+        remedy = "name the folder that holds the meshes, or one NPZ"
+        raise IngestError(Fault(str(path), "is neither a file nor a folder", remedy))
     if path.is_dir():
-        only = _only_gltf(path)
-        return _read_morphs(only) if only else _read_folder(path)
-    return _read_morphs(path) if _extension(path) in MORPH_FORMATS else _read_npz(path)
-
-
-def data_files(path: Path) -> list[Path]:
-    """Return the files that a collection is read from, sorted; none if the path doesn't exist."""
-    if path.is_file():
-        beside = path.parent.iterdir() if _extension(path) == "gltf" else ()
-        return [path, *sorted(p for p in beside if _extension(p) in _COMPANIONS and p.is_file())]
-    if not path.is_dir():
-        return []
-    return sorted(
-        p for p in path.iterdir() if _extension(p) in (*READ_FORMATS, *_COMPANIONS) and p.is_file() and p.name[0] != "."
-    )
-
-
-def _extension(path: Path) -> str:
-    return path.suffix.lstrip(".").lower()
-
-
-def _mesh_files(folder: Path) -> list[Path]:
-    """List the mesh files of a folder in natural order, at least 3 and with different names."""
-    files = [path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir()]
-    paths = sorted(
-        (path for path in files if _extension(path) in READ_FORMATS),
-        key=lambda path: (natural_order(path.stem), path.name),
-    )
-    if not paths:
-        others = sorted({path.suffix or path.name for path in files})
-        found = f"only {', '.join(others[:8])}" if others else "it has no files"
-        raise IngestError(f"{folder}: holds no meshes ({found}); these can be read: {', '.join(READ_FORMATS)}")
-    if len(paths) < MIN_SHAPES:
-        npz = _extension(paths[0]) == "npz"
-        hint = "; where an NPZ holds the whole collection, name that file, not its folder" if npz else ""
-        raise IngestError(f"{folder}: {TOO_FEW.format(len(paths))}{hint}")
-    by_name: dict[str, Path] = {}
-    for path in paths:
-        if path.stem in by_name:
-            raise IngestError(f"{path}: {by_name[path.stem].name} has the same name; remove or rename one of them")
-        by_name[path.stem] = path
-    return paths
+        only = None if file else _only_gltf(path)
+        return _read_morphs(only) if only else _read_folder(path, file)
+    if file:
+        raise IngestError(
+            Fault(str(path), "is a file", "--file NAME is for a folder whose folders have that file each")
+        )
+    return _read_morphs(path) if extension(path) in MORPH_FORMATS else _read_npz(path)
 
 
 def _only_gltf(folder: Path) -> Path | None:
     """Return the mesh file of a folder that holds one, if its format has morph targets."""
-    meshes = [p for p in data_files(folder) if _extension(p) in READ_FORMATS]
-    return meshes[0] if len(meshes) == 1 and _extension(meshes[0]) in MORPH_FORMATS else None
+    meshes = [p for p in data_files(folder) if extension(p) in READ_FORMATS]
+    return meshes[0] if len(meshes) == 1 and extension(meshes[0]) in MORPH_FORMATS else None
 
 
-def _read_folder(folder: Path) -> FileShapes:
-    paths = _mesh_files(folder)
+class _UnlikeError(IngestError):
+    """A readable file whose faces are not the same as in another file."""
+
+
+def _read_folder(folder: Path, file: str | None) -> FileShapes:
+    found = mesh_files(folder, file)
     # STL doesn't say which vertices triangles share. A file of another format does, so its faces count for all files.
-    stl = [_extension(path) == "stl" for path in paths]
-    template = stl.index(False) if False in stl else 0
-    vertices, faces = _read_mesh(paths[template])
+    order = sorted(range(len(found.paths)), key=lambda k: extension(found.paths[k]) == "stl")
+    shapes, unlike = _read_like_one(found, order)
+    if 2 * len(unlike) >= len(found.paths):  # then the first file is probably the odd one
+        others, still = _read_like_one(found, [k for k in order if k in unlike])
+        if len(still) < len(unlike):
+            shapes = others
+    return replace(shapes, notes=(*found.left_out, *_pose_notes(shapes.paths)))
+
+
+def _read_like_one(found: MeshFiles, candidates: Sequence[int]) -> tuple[FileShapes, list[int]]:
+    """Read files that must have the faces of one of them: of the first candidate that can be read.
+
+    Returns:
+        The shapes, with the faults of all other files; and the indices of the files with other faces.
+
+    Raises:
+        IngestError: no candidate can be read; with the faults of all.
+    """
+    unreadable = Faults(*found.faults)
+    for template in candidates:
+        with unreadable.gathered():
+            vertices, faces = _read_mesh(found.sources[template])
+            break
+    else:
+        unreadable.refuse()
+    faults, kept, unlike = Faults(*found.faults), list[int](), list[int]()
+    stl = [extension(path) == "stl" for path in found.paths]
 
     def shapes() -> Iterator[FloatArray]:
-        for k, path in enumerate(progress(paths, "reading", "file")):
-            if k == template:
-                yield vertices
-            else:
-                yield _read_like(path, paths[template], vertices, faces, triangles_only=stl[k] and not stl[template])
+        for k, source in enumerate(progress(found.sources, "reading", "file")):
+            shape = vertices
+            if k != template:
+                like = found.sources[template]
+                try:
+                    shape = _read_like(source, like, vertices, faces, triangles_only=stl[k] and not stl[template])
+                except IngestError as error:
+                    faults.found += error.faults
+                    unlike.extend([k] if isinstance(error, _UnlikeError) else [])
+                    continue
+            kept.append(k)
+            yield shape
 
-    shape_array = stacked(len(paths), shapes())
-    return FileShapes(tuple(map(ShapeSource.of_file, paths)), shape_array, faces, tuple(paths), all(stl))
+    array = stacked(len(found.paths), shapes())[: len(kept)]
+    sources, paths = tuple(found.sources[k] for k in kept), tuple(found.paths[k] for k in kept)
+    return FileShapes(sources, array, faces, paths, all(stl[k] for k in kept), faults=tuple(faults.found)), unlike
 
 
 def _read_like(
-    path: Path, template: Path, vertices: FloatArray, faces: IntArray, *, triangles_only: bool
+    source: ShapeSource, template: ShapeSource, vertices: FloatArray, faces: IntArray, *, triangles_only: bool
 ) -> FloatArray:
     """Read the vertices of a file that must have the faces of a template, vertices (V, 3) and faces (F, 3).
 
     With ``triangles_only`` the file doesn't say which vertices triangles share, and the template does.
     """
+    own_vertices, own_faces = _read_mesh(source, finite=False)
+    faults = Faults()
+    with faults.gathered(), refusing(source, remedy=_NOT_FINITE):
+        check_finite(own_vertices)
+    if faults.found and len(own_faces) == len(faces):
+        faults.refuse()
+    path, other = Path(source.label), Path(template.label)
     try:
-        own_vertices, own_faces = _read_mesh(path)
         _refuse_cut_short(path, len(own_vertices), own_faces, len(vertices), faces)
-        with refusing(ShapeSource.of_file(path)):
+        with refusing(source, remedy=f"export it like {template.file}", always=True):
             corners = own_vertices[own_faces]
             if triangles_only:
-                return _on_shared_vertices(corners, faces, len(vertices), template.name)
+                return _on_shared_vertices(corners, faces, len(vertices), template.file)
             if len(own_faces) == len(faces) and not np.array_equal(own_faces, faces):
                 # Exporters split vertices along sharp edges and seams, in each pose where they like.
                 with suppress(MeshError):
-                    shape = _on_shared_vertices(corners, faces, len(vertices), template.name)
+                    shape = _on_shared_vertices(corners, faces, len(vertices), template.file)
                     # The other way round too: vertices that this file shares have to coincide in the template.
-                    _on_shared_vertices(vertices[faces], own_faces, len(own_vertices), path.name)
+                    _on_shared_vertices(vertices[faces], own_faces, len(own_vertices), source.file)
                     return shape
-            _refuse_cut_short(template, len(vertices), faces, len(own_vertices), own_faces)
-            same_connectivity(own_vertices, own_faces, vertices, faces, template.name)
+            _refuse_cut_short(other, len(vertices), faces, len(own_vertices), own_faces)
+            same_connectivity(own_vertices, own_faces, vertices, faces, template.file)
     except IngestError as error:
-        if why := difference(path, template):
-            raise IngestError(f"{path}: has other faces than {template.name}: {why}") from error
-        raise
+        found = error.faults
+        if why := difference(path, other):
+            what = f"has other faces than {template.file}: {why}"
+            found = (Fault(source.label, what, f"export it like {template.file}"),)
+        raise _UnlikeError(*faults.found, *found) from error
     return own_vertices
 
 
-def _read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
-    """Read the vertices (V, 3) and faces (F, 3) of one file."""
-    try:
-        with refusing(ShapeSource.of_file(path)):
-            return mesh_arrays(*read_arrays(path))
-    except IngestError as error:
-        raise IngestError(f"{error}{_unfinished(path)}") from error
+def _read_mesh(source: ShapeSource, *, finite: bool = True) -> tuple[FloatArray, IntArray]:
+    """Read the vertices (V, 3) and faces (F, 3) of one file; ``finite`` as for `mesh_arrays`."""
+    path = Path(source.label)
+    remedy = _unfinished(path) or "export it again, or leave it out"
+    with refusing(source, remedy=remedy):
+        vertices, faces = mesh_arrays(*read_arrays(path), finite=False)
+    if finite:
+        with refusing(source, remedy=_NOT_FINITE):
+            check_finite(vertices)
+    return vertices, faces
+
+
+def _pose_notes(paths: Sequence[Path]) -> list[str]:
+    """Return a sentence on glTF files with sliders or joints, if any: each describes more shapes than one."""
+    posed = [path.name for path in paths if extension(path) in ("glb", "gltf") and can_be_posed(path)]
+    if not posed:
+        return []
+    more = f" and {len(posed) - 3} more" if len(posed) > 3 else ""
+    sentence = (
+        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); one shape is read from each "
+        "file, as its sliders and joints stand there"
+    )
+    return [sentence]
 
 
 def _unfinished(path: Path) -> str:
-    """Return the end of a sentence about an OBJ file whose last line isn't finished, as after an interrupted copy."""
-    if _extension(path) != "obj" or not path.is_file():
+    """Return what to do about an OBJ file whose last line isn't finished, as after an interrupted copy."""
+    if extension(path) != "obj" or not path.is_file():
         return ""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 200))
         last = file.read().decode(errors="replace")
     if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
         return ""
-    return f"; its last line, {last.splitlines()[-1][-60:]!r}, has no end: if the file is cut short, copy it again"
+    return "its last line has no end: if the file is cut short, copy it again"
 
 
 def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int, others: IntArray) -> None:
     """Refuse an OBJ file that is the beginning of another one: the format doesn't say how much a file holds."""
-    if _extension(path) != "obj" or not path.is_file():
+    if extension(path) != "obj" or not path.is_file():
         return
     # The last face may have lost digits.
     if count <= other_count and len(faces) < len(others) and np.array_equal(faces[:-1], others[: len(faces) - 1]):
-        raise IngestError(
-            f"{path}: is cut short, it seems: it ends after {count} of {other_count} vertices and {len(faces)} of "
-            f"{len(others)} faces{_unfinished(path) or '; copy it again'}"
-        )
+        what = f"it ends after {count} of {other_count} vertices and {len(faces)} of {len(others)} faces"
+        raise IngestError(Fault(str(path), f"is cut short, it seems: {what}", _unfinished(path) or "copy it again"))
 
 
 def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int, other: str) -> FloatArray:
@@ -205,21 +240,28 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
 
 
 def _read_npz(path: Path) -> FileShapes:
-    if _extension(path) != "npz":
-        raise IngestError(
-            f"{path}: one file is a collection only as .npz, or as .glb or .gltf whose morph targets are the shapes; "
-            "name the folder that holds the meshes"
-        )
+    if extension(path) != "npz":
+        what = "one file is a collection only as .npz, or as .glb or .gltf whose morph targets are the shapes"
+        raise IngestError(Fault(str(path), what, "name the folder that holds the meshes"))
     with refusing(ShapeSource.of_file(path)):
         arrays = _npz_arrays(path)
     sources = tuple(ShapeSource(f"{path}: shape {name}", name) for name in arrays["names"].tolist())
 
+    with refusing(sources[0]):
+        mesh_arrays(arrays["vertices"][0], arrays["faces"], finite=False)
+    faults, kept = Faults(), list[ShapeSource]()
+
     def checked() -> Iterator[FloatArray]:
         for source, shape in zip(sources, arrays["vertices"], strict=True):
-            with refusing(source):
-                yield mesh_arrays(shape, arrays["faces"])[0]
+            with faults.gathered(), refusing(source, remedy=_NOT_FINITE):
+                vertices = mesh_arrays(shape, arrays["faces"])[0]
+                kept.append(source)
+                yield vertices
 
-    return FileShapes(sources, stacked(len(sources), checked()), arrays["faces"].astype(np.int64))
+    vertices = stacked(len(sources), checked())[: len(kept)]
+    if not kept:
+        faults.refuse()
+    return FileShapes(tuple(kept), vertices, arrays["faces"].astype(np.int64), faults=tuple(faults.found))
 
 
 def _read_morphs(path: Path) -> FileShapes:
@@ -239,7 +281,7 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         arrays = read_mesh_npz(memoryview(path.read_bytes()), ("vertices", "faces", "names"))
     except OSError as error:
-        raise MeshError(f"can't be read: {error.strerror}") from error
+        raise MeshError(f"can't be read: {in_words(error, named=False)}") from error
     shapes = arrays["vertices"]
     if shapes.ndim != 3 or shapes.shape[2] != 3:
         raise MeshError(f"vertices must be an (n, V, 3) array, not of shape {shapes.shape}")

@@ -13,6 +13,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.files.limits import in_words
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile
 from shapespace.training.runs.directory import RunDirectory
@@ -40,7 +41,9 @@ class FactorRecord:
 def _readable(path: Path, read: Callable[[], Value]) -> Value:
     try:
         return read()
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ReportError(f"{path} can't be read: {in_words(error, named=False)}") from error
+    except ValueError as error:
         raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import tomlkit
 from pydantic import Field, ValidationError, model_validator
 
+from shapespace.files.limits import in_words
 from shapespace.shell.energy import Material
 from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings, NetworkSettings
 from shapespace.training.runs.settings import (
@@ -95,8 +96,13 @@ def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: can't be read: {error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{path}: can't be read: it is no text in UTF-8; name a configuration, CONFIG.toml"
+        ) from error
+    except OSError as error:
+        hint = "; init writes a configuration for a folder of meshes" if path.is_dir() else ""
+        raise ConfigError(f"{path}: can't be read: {in_words(error, named=False)}{hint}") from error
     config = parse(text, str(path))
     if data is None and config.collection.data is not None:
         data = path.parent / config.collection.data

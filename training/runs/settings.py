@@ -32,6 +32,9 @@ class CollectionSettings(SettingsTable):
     """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
     one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
     command's ``--data`` takes precedence."""
+    file: str | None = None
+    """Name of the file to read from each folder in ``data``, for data with one folder per subject. It may be a path, as
+    ``surf/pial.ply``, and have ``*`` and ``?`` in it, as ``*_mesh.ply``. Shapes have the names of the folders."""
     reference: str | None = None
     """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
     most central one."""

@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from shapespace.files.limits import in_words
+
 if TYPE_CHECKING:
     from distributed import Client
 
@@ -191,4 +193,5 @@ def _client(scheduler: str) -> Client:
     try:
         return Client(scheduler, timeout=CONNECT, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise WorkersError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+        why = in_words(error, named=False) if isinstance(error, OSError) else error
+        raise WorkersError(f"no Dask scheduler answers at {scheduler}: {why}") from error

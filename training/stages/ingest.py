@@ -91,7 +91,7 @@ def read_meshes(config: Config) -> MeshCollection:
         return MESHES[settings.generator]()
     if settings.data is None:
         raise ConfigError("collection.data: say where the meshes are, here or with --data")
-    return read_collection(settings.data, settings.parts)
+    return read_collection(settings.data, settings.parts, settings.file)
 
 
 def write_reference(run: RunDirectory, mesh: TriangleMesh, scale: float, **fine: np.ndarray) -> None:
@@ -202,7 +202,10 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="ingest",
     version=1,
-    settings=lambda config: [config.collection],
+    # Only where it is given: otherwise the digest is the same as in version 0.2, and no stage is done again.
+    settings=lambda config: [
+        config.collection.model_dump(mode="json", exclude=None if config.collection.file else {"file"})
+    ],
     run=ingest,
     results=lambda run: [
         run.reference.path,

@@ -9,11 +9,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from shapespace.training.collection.reading import data_files
+from shapespace.bundle.writer import require_replaceable
+from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.stages import (  # fmt: skip
+    STAGE_NAMES,
     evaluation,
     export,
     factors,
@@ -26,10 +28,8 @@ from shapespace.training.stages import (  # fmt: skip
 )
 from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
-STAGES: dict[str, Stage] = {
-    module.STAGE.name: module.STAGE
-    for module in (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
-}
+_MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
+STAGES: dict[str, Stage] = {name: module.STAGE for name, module in zip(STAGE_NAMES, _MODULES, strict=True)}
 
 
 class OldRunError(ValueError):
@@ -73,6 +73,7 @@ def execute(
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
         NotARunError: the run directory holds something else, or the collection's data.
+        BundleError: the place of the bundle holds something else.
         DamagedFileError: a file was damaged, and was so again after its stage had made it anew.
     """
     repaired = set[Path]()
@@ -104,6 +105,8 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
     directory = run.directory
     keys, data = _prepare(run, show)
     order = list(STAGES)
+    if until in (None, "export") and "seconds" not in directory.stamp("export").read_if_written():
+        require_replaceable(run.bundle)  # before hours of work
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
@@ -190,14 +193,15 @@ def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
     """
     source = run.config.collection.data
     known, found = run.directory.data.read_if_written(), {}
-    for path in data_files(source) if source else ():
+    for path in data_files(source, run.config.collection.file) if source else ():
+        name = path.relative_to(source).as_posix() if source and path != source else path.name
         stat = path.stat()
         facts = {"bytes": stat.st_size, "time": stat.st_mtime_ns}
-        before = known.get(path.name, {})
-        if any(before.get(name) != value for name, value in facts.items()):
+        before = known.get(name, {})
+        if any(before.get(fact) != value for fact, value in facts.items()):
             with path.open("rb") as file:
                 before = {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-        found[path.name] = {**facts, "sha256": before["sha256"]}
+        found[name] = {**facts, "sha256": before["sha256"]}
     return found
 
 

@@ -120,6 +120,7 @@ def test_models_out_of_reach_stay_loaded(shared: tuple[Path, Server]) -> None:
         reload(server)
         assert value(samples(client), "shapespace_reloaded_bundles_total", result="failed") == 1
     assert "can't be read, so that nothing changes" in server.log
+    assert "Errno" not in server.log
 
 
 def test_bundles_that_do_harm_are_refused_while_the_others_are_served(shared: tuple[Path, Server]) -> None:

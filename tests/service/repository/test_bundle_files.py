@@ -1,6 +1,7 @@
 """Writer and reader of bundles agree, and equal bundles are written byte for byte the same."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,10 +50,49 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 
 def test_equal_contents_give_equal_bytes_and_replace_what_is_there(tmp_path: Path) -> None:
-    folder = write_bundle(tmp_path, start=True)
-    (folder / "left-over").write_text("x")
+    write_bundle(tmp_path, fine=True)
     first = contents(write_bundle(tmp_path / "other", start=True))
     assert contents(write_bundle(tmp_path, start=True)) == first
+
+
+def _with_a_note(folder: Path) -> None:
+    write_bundle(folder.parents[1])
+    (folder / "notes.txt").write_text("mine")
+
+
+def _meshes(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / "pose.obj").write_text("v 0 0 0")
+
+
+def _other_manifest(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / MANIFEST).write_text('["of another program"]')
+
+
+def _one_file(folder: Path) -> None:
+    folder.parent.mkdir(parents=True)
+    folder.write_text("mine")
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (_with_a_note, "holds notes.txt, which no export wrote"),
+        (_meshes, "holds pose.obj, which no export wrote"),
+        (_other_manifest, "holds manifest.json, which no export wrote"),
+        (_one_file, "is no folder"),
+    ],
+)
+def test_a_folder_that_holds_anything_else_is_not_replaced(
+    build: Callable[[Path], None], says: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "small" / "1"
+    build(folder)
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    with pytest.raises(BundleError, match=says):
+        write_bundle(tmp_path, start=True)
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
 
 
 def test_the_manifest_keeps_the_order_and_the_names_of_the_schema(tmp_path: Path) -> None:

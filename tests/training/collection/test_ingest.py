@@ -13,7 +13,7 @@ import trimesh
 from shapespace.files.formats import MESH_FORMATS, VTK_FORMATS
 from shapespace.files.reading import READ_FORMATS
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 

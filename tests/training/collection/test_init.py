@@ -12,7 +12,7 @@ import trimesh
 
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.init import slug, write
 from shapespace.training.runs.config import Config, ConfigError, load, parse

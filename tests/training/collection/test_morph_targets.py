@@ -12,7 +12,7 @@ from shapespace.training.collection.appearance import reference_surface
 from shapespace.training.collection.checks import IngestError
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.init import write
-from shapespace.training.collection.reading import data_files
+from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.config import load
 from tests.shapespace.files.test_gltf_pose import File
 from tests.training.collection.test_ingest import FACES, SHAPES

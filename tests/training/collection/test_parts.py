@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,14 +12,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.attributes import Labels
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.appearance import reference_surface
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
-from shapespace.training.collection.init import configuration
+from shapespace.training.collection.init import configuration, write
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
-from shapespace.training.runs.config import parse
+from shapespace.training.runs.config import load, parse
 from tests.surfaces import ball, with_parts, write_files
 
 REST, SURFACE = with_parts(ball(2))
@@ -143,23 +145,111 @@ def test_two_shells_of_size_are_refused_unless_one_keeps_its_form(tmp_path: Path
     hard = np.concatenate([shapes, np.repeat(0.9 * shapes[:1] + [3, 0, 0], 4, axis=0)], axis=1)
     np.savez(tmp_path / "soft.npz", vertices=soft, faces=faces)
     np.savez(tmp_path / "hard.npz", vertices=hard, faces=faces)
-    with pytest.raises(IngestError, match=r"2 separate parts, .*'part 2'.* too large .* Train one model each"):
+    with pytest.raises(IngestError, match=r"2 separate parts, .*'part 2'.* too large .* train one model each"):
         read_collection(tmp_path / "soft.npz")
     assert [part.name for part in read_collection(tmp_path / "hard.npz").parts] == ["part 1", "part 2"]
 
 
-def test_there_may_not_be_more_parts_than_an_answer_can_take(tmp_path: Path) -> None:
+def with_specks(path: Path) -> int:
+    """Write an NPZ of a ball and 120 triangles as parts of their own; return the number of the ball's faces."""
     sphere = trimesh.creation.icosphere(2)
     specks = np.repeat(np.arange(120.0), 3)[:, None] * [0.01, 0, 0] + np.tile(0.005 * np.eye(3), (120, 1)) + [0, 2, 0]
     shapes = np.stack([np.concatenate([sphere.vertices * [1, 1, 1 + 0.3 * k], specks]) for k in range(3)])
     faces = np.concatenate([sphere.faces, len(sphere.vertices) + np.arange(360).reshape(-1, 3)])
-    np.savez(tmp_path / "specks.npz", vertices=shapes, faces=faces)
+    np.savez(path, vertices=shapes, faces=faces)
+    return len(sphere.faces)
+
+
+def test_there_may_not_be_more_parts_than_an_answer_can_take(tmp_path: Path) -> None:
+    count = with_specks(tmp_path / "specks.npz")
     with pytest.raises(IngestError, match="121 separate parts, where 100 are allowed"):
         read_collection(tmp_path / "specks.npz")
-    assert read_collection(tmp_path / "specks.npz", ["part 1"]).faces.shape == sphere.faces.shape
+    assert len(read_collection(tmp_path / "specks.npz", ["part 1"]).faces) == count
+
+
+def listed_parts(text: str) -> dict[str, int]:
+    """Names of parts and their numbers of vertices that a configuration lists."""
+    found = re.findall(r'^#   (".*") +(\d+) vertices +[\d.]+%$', text, flags=re.MULTILINE)
+    return {json.loads(name): int(count) for name, count in found}
 
 
 def test_init_names_the_parts(tmp_path: Path) -> None:
     text = configuration(collection(tmp_path), "shapes", "Shapes")
     assert '# parts = ["Bar", "Eye", "Nail"]' in text
     assert parse(text.replace("# parts", "parts"), "text").collection.parts == ["Bar", "Eye", "Nail"]
+    sizes = {name: len(np.unique(FACES[k == OBJECT])) for k, name in enumerate(NAMES)}
+    assert listed_parts(text) == sizes
+
+
+def test_init_selects_parts_by_name(tmp_path: Path) -> None:
+    collection(tmp_path / "shapes")
+    out, meshes = write(tmp_path / "shapes", tmp_path / "c.toml", parts=["Bar", "Nail"])
+    assert load(out)[0].collection.parts == ["Bar", "Nail"]
+    assert [part.name for part in meshes.parts] == ["Bar", "Nail"]
+    assert list(listed_parts(out.read_text())) == ["Bar", "Eye", "Nail"]
+    with pytest.raises(IngestError, match=r"no part 'Teeth'"):
+        write(tmp_path / "shapes", tmp_path / "d.toml", parts=["Teeth"])
+
+
+def test_init_selects_the_largest_part_where_not_all_can_be_kept(tmp_path: Path) -> None:
+    count = with_specks(tmp_path / "specks.npz")
+    out, meshes = write(tmp_path / "specks.npz", tmp_path / "c.toml")
+    assert any("where 100 are allowed" in note for note in meshes.notes)
+    assert "the largest alone" in out.read_text()
+    sizes = listed_parts(out.read_text())
+    assert len(sizes) == 121
+    assert (sizes["part 1"], sizes["part 121"]) == (162, 3)
+    config, _ = load(out)
+    assert config.collection.parts == ["part 1"]
+    assert config.collection.data
+    assert len(read_collection(config.collection.data, config.collection.parts).faces) == count == len(meshes.faces)
+
+
+@pytest.mark.parametrize("name", ["", "skin"])
+def test_init_selects_the_first_of_equal_halves(name: str, tmp_path: Path) -> None:
+    """Both halves may have one name, beside which an eye has its own."""
+    sphere = trimesh.creation.icosphere(2)
+    eye = trimesh.creation.icosphere(1, radius=0.1)
+    faces = np.concatenate([eye.faces, *(sphere.faces + k * len(sphere.vertices) + len(eye.vertices) for k in (0, 1))])
+    folder = tmp_path / "halves"
+    folder.mkdir()
+    for k in range(3):
+        shape = sphere.vertices * [1, 1, 1 + 0.3 * k]
+        away = np.array([3.0, 0, 0])
+        corners = np.concatenate([eye.vertices, shape + away, shape * [-1 - 1e-9, 1, 1] - away])
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in corners.tolist()]
+        for part, begins in (("eye", 0), (name, len(eye.faces))):
+            lines += [f"g {part}"] * bool(name)
+            some = faces[: len(eye.faces)] if part == "eye" else faces[begins:]
+            lines += ["f {} {} {}".format(*face) for face in (some + 1).tolist()]
+        (folder / f"shape{k}.obj").write_text("\n".join([*lines, ""]))
+    out, meshes = write(folder, tmp_path / "c.toml")
+    first = "skin 1" if name else "part 2"
+    config, _ = load(out)
+    assert config.collection.parts == [first]
+    assert set(listed_parts(out.read_text())) == {"eye", "skin 1", "skin 2"} if name else {"part 1", "part 2", "part 3"}
+    for found in (meshes, read_collection(folder, [first])):
+        np.testing.assert_allclose(found.vertices[1].mean(axis=0), [3, 0, 0], atol=1e-6)
+        assert len(found.faces) == len(sphere.faces)
+
+
+@pytest.mark.parametrize("format", ["obj", "glb", "stl"])
+def test_attached_parts_may_be_split_and_numbered_otherwise_in_each_file(format: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for k in range(4):
+        shape = stretched(k)
+        corners = FACES.ravel().copy()
+        alone = (rng.random(len(corners)) < 0.5) & (k > 0)
+        corners[alone] = len(shape) + np.arange(alone.sum())
+        vertices = np.concatenate([shape, shape[FACES.ravel()[alone]]])
+        order = rng.permutation(len(vertices)) if k else np.arange(len(vertices))
+        faces = np.argsort(order)[corners].reshape(-1, 3)
+        (tmp_path / f"shape{k}.{format}").write_bytes(MESH_FORMATS[format].encode(vertices[order], faces))
+    meshes = read_collection(tmp_path)
+    assert [len(part.faces) for part in meshes.parts] == [(k == OBJECT).sum() for k in (1, 0, 2)]
+    for k in range(4):
+        np.testing.assert_allclose(meshes.vertices[k][meshes.faces], stretched(k)[FACES], atol=1e-6)
+        for part, number in zip(meshes.parts, (1, 0, 2), strict=True):
+            own = meshes.vertices[k][meshes.faces[part.faces]]
+            np.testing.assert_allclose(own, stretched(k)[FACES[number == OBJECT]], atol=1e-6)
+    assert meshes.vertices.shape[1] == len(np.unique(FACES))

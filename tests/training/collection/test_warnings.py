@@ -11,7 +11,7 @@ import pytest
 
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training.collection import large_arrays
-from shapespace.training.collection.checks import IngestError
+from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.generators import figure
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection

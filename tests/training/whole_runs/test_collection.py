@@ -25,6 +25,7 @@ from benchmarks.studies import SeedLearner, ShareLearner
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.reader import read_bundle
 from shapespace.files.attributes.reading import read_attributes
+from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.__main__ import main
@@ -201,6 +202,20 @@ def test_the_server_encodes_the_user_s_own_files(url: str, run: Path, folder: Pa
         assert found["vertex_error"]["mean"] < 0.03 * diagonal
         assert len(found["vertex_errors"]) == vertices.shape[1]
         assert (np.array(found["latent"]) > lower - 0.5 * (upper - lower)).all()
+
+
+def test_files_that_number_their_vertices_otherwise_are_encoded_with_their_attached_parts(url: str) -> None:
+    vertices, faces = bars()
+    order = np.random.default_rng(2).permutation(len(vertices[2]))
+    flat = vertices[2][faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    codes = []
+    for shape, numbers in ((vertices[2], faces), (vertices[2][order], np.argsort(order)[faces]), flat):
+        content = MESH_FORMATS["ply"].encode(shape, numbers)
+        found = httpx.post(f"{url}/v1/models/bars/encode?format=ply", content=content, timeout=60).json()
+        codes.append(found["latent"])
+        assert found["status"] == "converged", found
+        assert len(found["vertex_errors"]) == len(vertices[2])
+    np.testing.assert_allclose(codes[1:], [codes[0]] * 2, atol=1e-4)
 
 
 def test_what_the_files_had_comes_back(url: str, run: Path, folder: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from shapespace.files.formats import MESH_FORMATS
-from shapespace.training import __main__ as command
+from shapespace.training.commands import HOME
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
@@ -47,13 +47,27 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) -> None:
     (place / "bad.toml").write_text("[collection]\n")
+    (place / "latin.toml").write_bytes("# Größe".encode("latin-1"))
+    (place / "models" / "bars" / "1").mkdir(parents=True)
+    (place / "models" / "bars" / "1" / "pose.obj").touch()
     for arguments, says in (
         (("run", "bad.toml"), "export: Field required"),
-        (("run", "none.toml"), "can't be read"),
+        (("run", "none.toml"), "none.toml: can't be read: there is no such file or folder"),
+        (("run", "meshes"), "meshes: can't be read: it is a folder"),
+        (("run", "latin.toml"), "it is no text in UTF-8"),
+        (("run", "bars.toml", "--out", "bad.toml/x"), "bad.toml/x/stages: it is a file or lies below one"),
+        (("run", "bars.toml", "--data", "none", "--until", "ingest"), "none: no such file or folder"),
+        (("run", "bars.toml"), "models/bars/1 holds pose.obj, which no export wrote"),
+        (("run", "bars.toml", "--models", "bad.toml"), "bad.toml is a file, and bundles lie in a folder"),
+        (("init", "meshes", "--out", "none/bars.toml"), "none/bars.toml: can't be written: there is no such"),
+        (("init", "meshes", "--out", "meshes", "--force"), "meshes: can't be written: it is a folder"),
         (("status", "nowhere"), "is no run directory"),
+        (("report", "meshes"), "is no run directory"),
+        (("export", "bad.toml"), "is no run directory"),
     ):
         said(*arguments, code=1)
-        assert says in said.errors
+        assert says in said.errors, arguments
+        assert len(said.errors.splitlines()) <= 2, said.errors
 
 
 def test_status_tells_how_far_a_run_is(run: Path, said: Said) -> None:
@@ -173,7 +187,7 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_nobody_disturbed(place: Path,
         [sys.executable, "-m", "shapespace.training", *killed],
         stdout=subprocess.DEVNULL,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+        env={**os.environ, "PYTHONPATH": str(HOME)},
     )
     while not list(place.glob("killed/samples/part-*.npz")):
         assert process.poll() is None, "the run ended before it could be killed"
@@ -210,6 +224,50 @@ def test_an_odd_shape_stops_the_run_until_it_is_accepted(place: Path, said: Said
     assert not (place / "runs" / "bars" / "reference.npz").exists()
     assert "bar3.obj: is of another size" in said(*run, "--accept", "bar3.obj")
     assert "bar3.obj: is of another size" in page(Record(RunDirectory(place / "runs" / "bars")))
+
+
+def test_one_folder_per_subject_is_read_from_init_to_report(place: Path, said: Said) -> None:
+    study = place / "study"
+    for k, shape in enumerate(SHAPES):
+        (study / f"sub-{k:02}").mkdir(parents=True)
+        write(study / f"sub-{k:02}" / "body.obj", shape)
+    (study / "dataset.json").touch()
+    (study / "sub-03" / "notes.txt").touch()
+    refused = said("init", "study", code=1)
+    assert "study: has no meshes, but its folders have; read one file from each folder" in refused
+    assert "--file body.obj (" in refused
+    words = said("init", "study", "--file", "body.obj")
+    notes = (
+        "left out, as only body.obj is read from each folder: notes.txt",
+        "left out, as they are not in a subject's folder: dataset.json",
+    )
+    assert all(f"  {note}\n" in words for note in notes)
+    run = "run", "study.toml", "--until", "ingest"
+    words = said(*run)
+    assert all(f"  {note}\n" in words for note in notes)
+    assert all(note.replace("'", "&#39;") in page(Record(RunDirectory(place / "runs" / "study"))) for note in notes)
+    with np.load(place / "runs" / "study" / "shapes.npz") as file:
+        assert file["names"].tolist()[:6] == [f"sub-{k:02}" for k in range(6)]
+        assert file["files"].tolist()[2] == "sub-02/body.obj"
+    assert "ingest: done before" in said(*run)
+    write(study / "sub-01" / "body.obj", SHAPES[1] * [1, 1.1, 1])
+    assert "data: 1 changed (sub-01/body.obj)" in said(*run)
+
+
+def test_all_faults_of_a_folder_are_one_table(place: Path, said: Said) -> None:
+    meshes = place / "meshes"
+    (meshes / "bar1.obj").write_text("")
+    write(meshes / "bar2.obj", 1000 * SHAPES[2])
+    write(meshes / "bar5.obj", SHAPES[5])
+    for command_line in (("init", "meshes"), ("run", "bars.toml", "--until", "ingest")):
+        said(*command_line, code=1)
+        head, columns, *rows = said.errors.splitlines()
+        assert head == "shapespace-train: the meshes have 2 faults:"
+        assert columns.split() == ["file", "what", "is", "wrong", "what", "to", "do"]
+        assert [Path(row.split()[0]).name for row in rows] == ["bar1.obj", "bar2.obj"]
+        assert re.search("has no faces  +export it again, or leave it out$", rows[0])
+        assert re.search(r"is of another size: .* median's  +is it in another unit\? .* --accept bar2\)$", rows[1])
+    assert not (place / "meshes.toml").exists()
 
 
 def done_up_to_modes(place: Path, said: Said) -> Path:
@@ -271,7 +329,7 @@ def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "PYTHONPATH": str(command.HOME)},
+        env={**os.environ, "PYTHONPATH": str(HOME)},
     )
     assert done.returncode == 70
     assert "Traceback" not in done.stderr
