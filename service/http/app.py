@@ -9,7 +9,6 @@ from contextlib import asynccontextmanager
 
 from fastapi import Depends, FastAPI
 from starlette.middleware import Middleware
-from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.service.http import error_handlers
@@ -30,6 +29,7 @@ from shapespace.service.operation.reloading import Reloader
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, is_loopback
+from shapespace.solve.blas_threads import OneBlasThread
 
 #: Headers that pages of other origins may send, and headers of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
@@ -50,7 +50,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         # BLAS computes in the thread that calls it: its own threads would multiply with the workers.
-        with threadpool_limits(1):
+        with OneBlasThread():
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
             repository = ModelRepository(

@@ -73,7 +73,7 @@ def _serve(connection: Connection, request: Mapping[str, Any]) -> None:
 
     reply, arrays = _outcome(run)
     trim_heap()
-    parts = (memoryview(array.reshape(-1).view("u1")) for array in arrays.values())
+    parts = (array.reshape(-1).view("u1").data for array in arrays.values())
     send(connection, reply | {"arrays": describe_arrays(arrays), "memory": resident_size()}, parts)
 
 
