@@ -109,7 +109,7 @@ class Server(uvicorn.Server):
         error = context.get("exception")
         if isinstance(error, OSError) and error.errno in _OUT_OF_HANDLES:  # asyncio tells it thousands of times
             self._no_handles.event()
-        else:
+        elif not (self.should_exit and isinstance(error, ValueError)):  # it tries a port again that is closed by now
             loop.default_exception_handler(context)
 
     async def on_tick(self, counter: int) -> bool:
