@@ -14,6 +14,8 @@ from shapespace.command_line import USAGE, CommandParser, missing_packages
 if TYPE_CHECKING:
     from shapespace.service.repository.validation import BundleValidator
 
+#: Seconds after which a thread that computes lets another one run, so that the event loop and short calls wait less.
+SWITCH_SECONDS = 0.0005
 #: Length in characters below which a key is reported as short.
 SHORT_KEY = 16
 #: Packages of the extra ``serve`` by the names of their modules, without those that are only faster.
@@ -49,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from shapespace.service.repository.validation import BundleValidator
 
     tune_malloc()
+    sys.setswitchinterval(SWITCH_SECONDS)
     validator = BundleValidator()
     try:
         validator.prepare()  # imports in a second process while this one imports

@@ -25,18 +25,19 @@ def printable(text: str) -> str:
 
 
 class RateLimitedLog:
-    """One log line for many equal events, at most once in LOG_INTERVAL, with their number."""
+    """One log line for many similar events, at most once in LOG_INTERVAL, with their number and the latest detail."""
 
     def __init__(self, logger: logging.Logger, level: int, text: str) -> None:
         self._logger, self._level, self._text = logger, level, text
         self._events, self._next = 0, 0.0
 
-    def event(self) -> None:
+    def event(self, detail: str = "") -> None:
         """Count an event, and log a line if the last one is old enough."""
         self._events += 1
         now = time.monotonic()
         if now >= self._next:
-            self._logger.log(self._level, "%s (%d × since the last such line)", self._text, self._events)
+            text = f"{self._text}: {detail}" if detail else self._text
+            self._logger.log(self._level, "%s (%d × since the last such line)", text, self._events)
             self._events, self._next = 0, now + LOG_INTERVAL
 
 
@@ -88,3 +89,5 @@ def configure(format: LogFormat) -> None:
     handler.setFormatter(formatter)
     handler.addFilter(_RequestIdFilter())
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    # The connection counts and logs the same event, at most once a second.
+    logging.getLogger("uvicorn.error").addFilter(lambda record: "Invalid HTTP request" not in record.msg)

@@ -97,7 +97,8 @@ class Settings(BaseSettings):
         description="port that answers /metrics without a key; 0 takes a free one; by default none",
     )
     workers: PositiveInt = Field(
-        default_factory=cpu_quota, description="shapes computed at once; by default the processors allowed"
+        default_factory=cpu_quota,
+        description="shapes computed at once, at most half of them for long calls; by default the processors allowed",
     )
     queue: int = Field(default=32, ge=0, description="requests that may wait for a worker; further ones get 503")
     deadline: PositiveFloat = Field(default=60.0, description="seconds a request may take before it gets 504")

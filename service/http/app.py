@@ -9,8 +9,6 @@ from contextlib import asynccontextmanager
 
 from fastapi import Depends, FastAPI
 from starlette.middleware import Middleware
-from starlette.middleware.cors import CORSMiddleware
-from threadpoolctl import threadpool_limits
 
 from shapespace import __version__
 from shapespace.service.http import error_handlers
@@ -18,7 +16,7 @@ from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
-from shapespace.service.http.middleware.access import RequireHost, RequireKey
+from shapespace.service.http.middleware.access import CrossOrigin, RequireHost, RequireKey
 from shapespace.service.http.middleware.compress import Compress
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import QUIET, Observe
@@ -31,6 +29,7 @@ from shapespace.service.operation.reloading import Reloader
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, is_loopback
+from shapespace.solve.blas_threads import OneBlasThread
 
 #: Headers that pages of other origins may send, and headers of answers that they may read.
 CORS_REQUEST = ["Authorization", "Content-Type", "If-None-Match", "Inference-Header-Content-Length"]
@@ -51,12 +50,12 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         # BLAS computes in the thread that calls it: its own threads would multiply with the workers.
-        with threadpool_limits(1):
+        with OneBlasThread():
             workers = Workers(settings.workers, settings.queue, settings.deadline)
             connections = Connections(settings.max_connections, settings.deadline, settings.trusted_proxies)
             repository = ModelRepository(
                 settings.models_dir,
-                settings.workers,
+                workers.threads,
                 validator,
                 settings.default_versions,
                 settings.default_versions_file,
@@ -70,12 +69,10 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
             app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
             # Threads that read bodies and folders, apart from the workers.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
-            chores = [asyncio.create_task(connections.check_timeouts())]
-            if settings.watch:
-                chores.append(asyncio.create_task(reloader.watch(settings.watch)))
+            watching = asyncio.create_task(reloader.watch(settings.watch)) if settings.watch else None
             yield
-            for chore in chores:
-                chore.cancel()
+            if watching:
+                watching.cancel()
             repository.close()
             sandbox.close()
             workers.close()
@@ -118,7 +115,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
     if settings.cors_origins:
         # Outermost, so that pages can read every refusal, and because a preflight has no key.
         cors = Middleware(
-            CORSMiddleware,
+            CrossOrigin,
             allow_origins=settings.cors_origins,
             allow_methods=["GET", "POST"],
             allow_headers=CORS_REQUEST,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -120,9 +120,13 @@ def query_names(request: Request) -> list[str] | None:
 
 
 async def known_query(request: Request) -> None:
-    """Raise ProblemError for query parameters that the description of a call does not list."""
+    """Raise ProblemError for query parameters that the call does not have, and for one that is given twice."""
     listed = query_names(request)
     unknown = [] if listed is None else [name for name in request.query_params if name not in listed]
     if unknown:
         choice = f"choose among {', '.join(listed)}" if listed else "this call has none"
         raise ProblemError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
+    given = Counter(name for name, _ in request.query_params.multi_items())
+    # A list of numbers may come as several parameters, as some client libraries send lists.
+    if twice := [name for name, count in given.items() if count > 1 and name != "latent"]:
+        raise ProblemError("invalid-request", f"The query has {twice[0]!r} {given[twice[0]]} times. Send it once.")

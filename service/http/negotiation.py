@@ -69,4 +69,6 @@ def _weight(media_type: str, ranges: list[tuple[str, float]]) -> float:
 def _not_acceptable(formats: Mapping[str, str], fault: str) -> ProblemError:
     choices = [{"format": name, "media_type": media_type} for name, media_type in formats.items()]
     listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
-    return ProblemError("not-acceptable", f"{fault}. Choose one of {listed} by ?format= or Accept.", choices=choices)
+    error = ProblemError("not-acceptable", f"{fault}. Choose one of {listed} by ?format= or Accept.", choices=choices)
+    error.headers = {"Vary": "Accept"}
+    return error

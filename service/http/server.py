@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import signal
 import socket
-import struct
 import sys
 import threading
-from array import array
+import time
+from contextlib import suppress
+from functools import partial
 from types import FrameType
 from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
 
-from shapespace.service.http.connections import Connection
-from shapespace.service.http.listener import Listener
+from shapespace.service.http.connections import HEAD_BYTES, Connection
+from shapespace.service.logs import RateLimitedLog
 from shapespace.service.operation.metrics_port import MetricsPort
 from shapespace.service.settings import Settings
 
 logger = logging.getLogger(__name__)
 #: Exit status of a process that could not start, as in uvicorn.
 STARTUP_FAILURE = 3
-#: A classic BPF program (code, jt, jf, k) that drops TCP segments with SYN, and its socket option on Linux.
-_DROP_SYN = ((0x30, 0, 0, 13), (0x45, 0, 1, 0x02), (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF))
-_SO_ATTACH_FILTER = 26
-
-
+#: Errors of an address that the machine does not have, as `localhost` by IPv6 in a container without IPv6.
+_NO_SUCH_ADDRESS = frozenset({errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL})
+_OUT_OF_HANDLES = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+#: Bytes of an answer that the kernel may buffer unsent; its default is megabytes.
+UNSENT_BYTES = 128 * 2**10
 #: Seconds from the end of the drain in which requests on open connections are still accepted, after which running
 #: requests get 503, and after which the process ends, whatever it does.
 LINGER, FINISH, EXIT = 1.0, 1.5, 2.3
@@ -53,6 +55,7 @@ class Server(uvicorn.Server):
             uvicorn.Config(
                 app,
                 http=self._connection,  # type: ignore[arg-type]
+                h11_max_incomplete_event_size=HEAD_BYTES,
                 ws="none",
                 loop="asyncio",
                 log_config=None,
@@ -64,15 +67,18 @@ class Server(uvicorn.Server):
             )
         )
         self._app, self._settings = app, settings
-        self._reloads: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[Any]] = set()
         self._signals: list[int] = []
+        self._listeners: list[socket.socket] = []
+        text = "out of file handles, so that new connections wait"
+        self._no_handles = RateLimitedLog(logger, logging.ERROR, text)
         self._terminal = sys.stdin is not None and sys.stdin.isatty()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen, and print the address."""
         host, port, metrics_port = self._settings.host, self._settings.port, self._settings.metrics_port
         try:
-            listeners = Listener.bound(host, port)
+            self._listeners = _bound(host, port)
             metrics = None
             if metrics_port is not None:
                 port = metrics_port
@@ -80,12 +86,14 @@ class Server(uvicorn.Server):
         except OSError as error:
             logger.error("can't listen on %s, port %d: %s", host, port, error.strerror)
             raise SystemExit(STARTUP_FAILURE) from None
-        await super().startup(sockets=list(listeners))
+        await super().startup(sockets=self._listeners)
         if metrics:
             metrics.serve(self._app.state.service.metrics.registry)
-        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._hang_up)
+        loop = asyncio.get_running_loop()
+        loop.add_signal_handler(signal.SIGHUP, self._hang_up)
+        loop.set_exception_handler(self._report)
         # Port 0 lets the system choose one.
-        host, port = self.servers[0].sockets[0].getsockname()[:2]
+        host, port = self._listeners[0].getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
         print(f"shapespace is at http://{host}:{port}/", flush=True)
 
@@ -94,8 +102,23 @@ class Server(uvicorn.Server):
             self.handle_exit(signal.SIGINT, None)
             return
         task = asyncio.ensure_future(self._app.state.service.reloader.reload())
-        self._reloads.add(task)
-        task.add_done_callback(self._reloads.discard)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _report(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if isinstance(error, OSError) and error.errno in _OUT_OF_HANDLES:  # asyncio tells it thousands of times
+            self._no_handles.event()
+        elif not (self.should_exit and isinstance(error, ValueError)):  # it tries a port again that is closed by now
+            loop.default_exception_handler(context)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Look after the connections once a second."""
+        if counter % 10 == 0:
+            for connection in tuple(self.server_state.connections):
+                assert isinstance(connection, Connection)  # noqa: S101 - narrows the type
+                connection.check_timeouts(time.monotonic())
+        return await super().on_tick(counter)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin the shutdown; a second signal ends the drain."""
@@ -113,7 +136,7 @@ class Server(uvicorn.Server):
         """Drain, then let running requests finish."""
         loop = asyncio.get_running_loop()
         # SIGINT comes from a person, who does not want to wait.
-        drained = loop.time() if signal.SIGINT in self._signals else await self._drain()
+        drained = loop.time() - LINGER if signal.SIGINT in self._signals else await self._drain()
         loop.call_at(drained + FINISH, self._app.state.service.workers.end)
         await super().shutdown(sockets)
 
@@ -128,27 +151,44 @@ class Server(uvicorn.Server):
         while time() < end and len(self._signals) < 2:
             await asyncio.sleep(0.05)
         drained = time()
-        for server in self.servers:
-            for listener in server.sockets:
-                _drop_new_connections(listener)
-        await asyncio.sleep(0.05)  # connections that are being opened are still accepted
+        self._close_listeners()
         while self.server_state.connections and time() < drained + LINGER:
             await asyncio.sleep(0.05)
         return drained
 
+    def _close_listeners(self) -> None:
+        """Close the port, after a last look for connections that the system has made already.
 
-def _drop_new_connections(listener: socket.socket) -> None:
-    """Let no new connection begin, while connections that have begun can still be accepted.
+        Closing resets the connections that the program has not accepted, and so loses their requests.
+        """
+        make = partial(
+            self._connection, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
+        loop = asyncio.get_running_loop()
+        for listener, server in zip(self._listeners, self.servers, strict=True):
+            with suppress(OSError):
+                while True:
+                    self._tasks.add(loop.create_task(loop.connect_accepted_socket(make, listener.accept()[0])))
+            server.close()
 
-    Closing the port would reset connections that the system has made and the program has not accepted yet. Their
-    clients would lose a request, even behind a proxy, which must not send a POST twice. Once SYN segments are dropped,
-    no further connections are made. A client that tries again after a second finds the port closed. A last ``accept``
-    before ``close`` is no substitute, because a connection can arrive between the two. Only Linux has this filter.
-    """
-    instructions = array("B", b"".join(struct.pack("HBBI", *instruction) for instruction in _DROP_SYN))
-    address, _ = instructions.buffer_info()
-    program = struct.pack("HP", len(_DROP_SYN), address)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
-    except OSError as error:
-        logger.debug("the port is closed without a filter: %s", error)
+
+def _bound(host: str, port: int) -> list[socket.socket]:
+    """Return listening sockets for every address of a host that this machine has; raises OSError if it has none."""
+    found = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    listeners: list[socket.socket] = []
+    missing: OSError | None = None
+    for family, _, _, _, address in dict.fromkeys(found):
+        try:
+            listener = socket.create_server(address, family=family)
+        except OSError as error:
+            if error.errno not in _NO_SUCH_ADDRESS:
+                raise
+            missing = error
+            continue
+        listener.setblocking(False)
+        if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)  # connections inherit it
+        listeners.append(listener)
+    if missing and not listeners:
+        raise missing
+    return listeners

@@ -7,8 +7,9 @@ needed in any case. Only a process also stops a reader that is slow, hangs or cr
 for every line of every reader, while a reader has to count at each of its allocations.
 
 A child is a fresh interpreter, not a fork of the server. The server sends it the name of a function, arguments as JSON
-and a body as bytes. The child answers with JSON and arrays, at most as many bytes as the caller allows, and never with
-a pickle. If a file breaks the child, the caller gets an error in one sentence, and the next call a new child.
+and a body as bytes. The child answers with JSON and arrays, at most as many bytes as the caller allows. If a file
+breaks the child, the caller gets an error in one sentence, and the next call a new child. Pools of processes, as those
+of ``concurrent.futures`` and Pebble, unpickle what a child answers, so that a hostile file could go on in the server.
 
 A child has none of the server's settings, can't write files, and ends when the server ends, in whatever way.
 """
@@ -17,9 +18,7 @@ from __future__ import annotations
 
 import math
 import os
-import select
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -27,6 +26,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,6 @@ from shapespace.service.limits.sandbox_wire import (
     receive,
     receive_arrays,
     send,
-    send_all,
 )
 from shapespace.solve.deadline import Deadline
 
@@ -64,8 +63,8 @@ Pieces = deque[memoryview]
 
 #: A child is replaced when it uses this many bytes more than at its start.
 GROWTH = 128 * 2**20
-#: Milliseconds between two checks of the deadline. A cancelled request moves its deadline to now.
-_CHECK_INTERVAL = 200
+#: Seconds between two checks of the deadline. A cancelled request moves its deadline to now.
+_CHECK_INTERVAL = 0.2
 #: Seconds in which a child has to exit after it has closed its connection.
 _EXIT_TIME = 5.0
 
@@ -188,8 +187,7 @@ class _Child:
         own, paths = str(Path(__file__).parents[3]), [path for path in sys.path if path]
         environment["PYTHONPATH"] = os.pathsep.join(paths if own in paths else [own, *paths])
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-        self._connection, theirs = socket.socketpair()
-        self._connection.setblocking(False)
+        self._connection, theirs = Pipe()
         try:
             self._process = subprocess.Popen(  # noqa: S603 - the arguments are this interpreter, a number and a name of TASKS
                 [sys.executable, "-P", "-m", "shapespace.service.limits.sandbox_child", str(theirs.fileno()), path],
@@ -222,28 +220,34 @@ class _Child:
         self, path: str, facts: Mapping[str, Any], body: Pieces | None, deadline: Deadline, memory: int, most: int
     ) -> tuple[JsonObject, Arrays]:
         """Run a task, as `Sandbox.call`. After an exception other than FailedError the child can't be used again."""
-
-        def wait(event: int) -> None:
-            poll = select.poll()
-            poll.register(self._connection, event)
-            while not deadline.passed:
-                if poll.poll(_CHECK_INTERVAL):
-                    return
-            raise TimeoutError
-
-        with self._as_sandbox_errors(deadline):
+        with self._killed_by(deadline), self._as_sandbox_errors(deadline):
             if self._memory_at_start is None:
-                self._memory_at_start = int(receive(self._connection, wait)["memory"])
+                self._memory_at_start = int(receive(self._connection)["memory"])
             length = sum(map(len, body)) if body else 0
             seconds = math.ceil(deadline.time - time.monotonic())
             request = {"task": path, "facts": facts, "body": length, "memory": memory, "seconds": seconds}
-            send(self._connection, request, wait)
-            while body:
-                send_all(self._connection, body.popleft(), wait)
-            reply = receive(self._connection, wait)
+            send(self._connection, request, _taken_from(body or Pieces()))
+            reply = receive(self._connection)
             self._memory = int(reply["memory"])
             _raise(reply)
-            return dict(reply["facts"]), receive_arrays(self._connection, reply["arrays"], most, wait)
+            return dict(reply["facts"]), receive_arrays(self._connection, reply["arrays"], most)
+
+    @contextmanager
+    def _killed_by(self, deadline: Deadline) -> Iterator[None]:
+        """Kill the process when the deadline passes, so that nothing waits for it any longer."""
+        done = threading.Event()
+
+        def watch() -> None:
+            while not done.wait(_CHECK_INTERVAL):
+                if deadline.passed:
+                    self.kill()
+                    return
+
+        threading.Thread(target=watch, daemon=True).start()
+        try:
+            yield
+        finally:
+            done.set()
 
     @contextmanager
     def _as_sandbox_errors(self, deadline: Deadline) -> Iterator[None]:
@@ -251,9 +255,11 @@ class _Child:
         seconds = deadline.time - time.monotonic()
         try:
             yield
-        except TimeoutError:
-            raise LateError(f"it took longer than {max(round(seconds, 1), 0):g} s") from None
-        except (OSError, EOFError):
+        except (OSError, EOFError) as error:
+            if deadline.passed:
+                raise LateError(f"it took longer than {max(round(seconds, 1), 0):g} s") from None
+            if str(error) == "bad message length":
+                raise DiedError("it answered what can't be read") from None
             raise self._exit_error() from None
         except (ValueError, TypeError, LookupError, RecursionError):
             raise DiedError("it answered what can't be read") from None
@@ -281,6 +287,11 @@ class _Child:
         self.kill()
         self._process.wait()
         self._connection.close()
+
+
+def _taken_from(body: Pieces) -> Iterator[memoryview]:
+    while body:
+        yield body.popleft()
 
 
 def _raise(reply: Mapping[str, Any]) -> None:

@@ -11,17 +11,25 @@ import os
 import resource
 import select
 import signal
-import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
 from shapespace.service.limits.sandbox_errors import FailedError, in_a_line
-from shapespace.service.limits.sandbox_wire import LONGEST_SENTENCE, Arrays, JsonObject, receive, receive_exactly, send
+from shapespace.service.limits.sandbox_wire import (
+    LONGEST_SENTENCE,
+    Arrays,
+    JsonObject,
+    describe_arrays,
+    receive,
+    receive_exactly,
+    send,
+)
 
 #: A function ``(body, **facts)`` that returns facts and arrays.
 Task = Callable[..., tuple[JsonObject, Arrays]]
@@ -29,7 +37,7 @@ Task = Callable[..., tuple[JsonObject, Arrays]]
 
 def main() -> None:
     """Serve the calls of the parent until the parent ends."""
-    connection = socket.socket(fileno=int(sys.argv[1]))
+    connection = Connection(int(sys.argv[1]))
     # Ctrl-C in a terminal, or a signal to the process group, reaches the children too. Only the parent may end them.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -47,7 +55,7 @@ def main() -> None:
             _serve(connection, receive(connection))
 
 
-def _exit_with_parent(connection: socket.socket) -> None:
+def _exit_with_parent(connection: Connection) -> None:
     """End this process when its parent ends, even in the middle of a task."""
     poll = select.poll()
     poll.register(connection, 0)  # no event but the end of the connection
@@ -55,7 +63,7 @@ def _exit_with_parent(connection: socket.socket) -> None:
     os._exit(1)
 
 
-def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
+def _serve(connection: Connection, request: Mapping[str, Any]) -> None:
     bodies = [receive_exactly(connection, request["body"])]
 
     def run() -> tuple[JsonObject, Arrays]:
@@ -65,10 +73,8 @@ def _serve(connection: socket.socket, request: Mapping[str, Any]) -> None:
 
     reply, arrays = _outcome(run)
     trim_heap()
-    described = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-    send(connection, reply | {"arrays": described, "memory": resident_size()})
-    for array in arrays.values():
-        connection.sendall(array.data.cast("B") if array.size else b"")
+    parts = (array.reshape(-1).view("u1").data for array in arrays.values())
+    send(connection, reply | {"arrays": describe_arrays(arrays), "memory": resident_size()}, parts)
 
 
 def _outcome(run: Callable[[], tuple[JsonObject, Arrays]]) -> tuple[JsonObject, Arrays]:

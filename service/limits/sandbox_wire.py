@@ -1,15 +1,12 @@
-"""Messages between a sandbox and its children: length of a JSON text, the text, then plain bytes. Never a pickle."""
+"""Messages between a sandbox and its children: a JSON text, then plain bytes in pieces. Never a pickle."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-import select
-import socket
-import struct
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -17,60 +14,43 @@ if TYPE_CHECKING:
 
 JsonObject = dict[str, Any]
 Arrays = dict[str, "NDArray[Any]"]
-#: A function that waits until a connection is ready for an event of ``select.poll``.
-Wait = Callable[[int], None]
 
 #: Most bytes of JSON in one message, and most characters of a sentence in it.
 LONGEST_MESSAGE, LONGEST_SENTENCE = 2**20, 1000
-_LENGTH = struct.Struct("!I")
 _PIECE = 2**20
 _DTYPE = re.compile(r"[<|>][fiub][1248]")
 
 
-def _no_wait(_: int) -> None:
-    """Return at once: the connection of a child blocks by itself."""
+def send(connection: Connection, message: Mapping[str, Any], parts: Iterable[memoryview] = ()) -> None:
+    """Send a message and the bytes that follow it; raises OSError."""
+    connection.send_bytes(json.dumps(message).encode())
+    for part in parts:
+        for start in range(0, len(part), _PIECE):
+            connection.send_bytes(part[start : start + _PIECE])
 
 
-def send(connection: socket.socket, message: Mapping[str, Any], wait: Wait = _no_wait) -> None:
-    """Send a message; raises OSError."""
-    data = json.dumps(message).encode()
-    send_all(connection, _LENGTH.pack(len(data)) + data, wait)
-
-
-def send_all(connection: socket.socket, data: bytes | bytearray | memoryview, wait: Wait) -> None:
-    """Send bytes; raises OSError."""
-    rest = memoryview(data)
-    while rest:
-        wait(select.POLLOUT)
-        with suppress(BlockingIOError):
-            rest = rest[connection.send(rest[:_PIECE]) :]
-
-
-def receive(connection: socket.socket, wait: Wait = _no_wait) -> dict[str, Any]:
-    """Return the next message; raises EOFError at the end, and ValueError if it is no message."""
-    (length,) = _LENGTH.unpack(receive_exactly(connection, _LENGTH.size, wait))
-    if length > LONGEST_MESSAGE:
-        raise ValueError
-    message = json.loads(receive_exactly(connection, length, wait))
+def receive(connection: Connection) -> JsonObject:
+    """Return the next message; raises EOFError at the end, ValueError or OSError if it is no message."""
+    message = json.loads(connection.recv_bytes(LONGEST_MESSAGE))
     if not isinstance(message, dict):
         raise ValueError
     return message
 
 
-def receive_exactly(connection: socket.socket, length: int, wait: Wait = _no_wait) -> bytearray:
-    """Return ``length`` bytes; raises EOFError if the connection ends before."""
-    # Piece by piece, so that data that never come take no memory.
+def receive_exactly(connection: Connection, length: int) -> bytearray:
+    """Return the ``length`` bytes that follow a message; raises as `receive`."""
     data = bytearray()
     while len(data) < length:
-        wait(select.POLLIN)
-        piece = connection.recv(min(length - len(data), _PIECE))
-        if not piece:
-            raise EOFError
-        data += piece
+        data += connection.recv_bytes(min(length - len(data), _PIECE))
     return data
 
 
-def receive_arrays(connection: socket.socket, described: Any, most: int, wait: Wait) -> Arrays:
+def describe_arrays(arrays: Arrays) -> list[tuple[str, str, tuple[int, ...]]]:
+    """Return what `receive_arrays` has to know about arrays."""
+    return [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
+
+
+def receive_arrays(connection: Connection, described: Any, most: int) -> Arrays:
     """Return the arrays that follow a message, which describes them; raises ValueError for more than ``most`` bytes."""
     import numpy as np
 
@@ -82,5 +62,5 @@ def receive_arrays(connection: socket.socket, described: Any, most: int, wait: W
         most -= length
         if most < 0:
             raise ValueError
-        arrays[str(name)] = np.frombuffer(receive_exactly(connection, length, wait), dtype).reshape(shape)
+        arrays[str(name)] = np.frombuffer(receive_exactly(connection, length), dtype).reshape(shape)
     return arrays

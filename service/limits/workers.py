@@ -1,17 +1,16 @@
 """Threads that compute, with a bounded queue and a deadline for each request.
 
 The event loop answers a request by its deadline, when its client leaves, or when the server ends, whatever its thread
-does. Work checks its deadline itself and ends soon after. A thread that does not is abandoned, and a new one takes its
-place. A search may answer its best result a little later than its deadline.
+does. Work checks its deadline itself and ends soon after. A search may answer its best result a little later than its
+deadline.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -19,17 +18,13 @@ from functools import partial
 from typing import TypeVar
 
 from shapespace.service.limits.quota import Quota, QuotaError
+from shapespace.service.limits.turns import Turns
 from shapespace.solve.deadline import Deadline
 
-logger = logging.getLogger(__name__)
 S = TypeVar("S")
 T = TypeVar("T")
-#: Seconds in which a thread has to stop after the end of its call. Otherwise it is abandoned.
-GRACE_SECONDS = 2.0
 #: Seconds after its deadline in which a search may complete its best result.
 SEARCH_GRACE_SECONDS = 5.0
-#: Largest number of abandoned threads.
-MOST_ABANDONED = 16
 #: Bytes that all answers with many shapes may use together.
 MEMORY = 384 * 2**20
 #: What a client can do whose request was not answered by its deadline.
@@ -54,13 +49,17 @@ class EndingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Caller:
-    """The client of a request: its name for quotas, empty if it is unknown.
+    """The client of a request.
 
-    ``gone`` waits until it has left, and returns the error for its work.
+    Attributes:
+        client: its name for quotas, empty if it is unknown.
+        gone: waits until it has left, and returns the error for its work.
+        long: whether its request may take seconds, so that it has to leave some threads to short ones.
     """
 
     client: str
     gone: Callable[[], Awaitable[Exception]]
+    long: bool = False
 
 
 class Call(Deadline):
@@ -70,8 +69,9 @@ class Call(Deadline):
         searching: whether the work is a search, for whose result the event loop waits SEARCH_GRACE_SECONDS more.
     """
 
-    def __init__(self, seconds: float, late: Exception) -> None:
+    def __init__(self, caller: Caller, seconds: float, late: Exception) -> None:
         super().__init__(seconds)
+        self.caller = caller
         loop = asyncio.get_running_loop()
         self._over: asyncio.Future[None] = loop.create_future()
         self._over.add_done_callback(lambda end: end.cancelled() or end.exception())  # or asyncio complains
@@ -110,28 +110,24 @@ class Workers:
     """A pool of threads for everything that would block the event loop.
 
     Requests are admitted up to a limit. A request submits its shapes one by one, at most as many at once as there are
-    threads. So a single shape doesn't wait for the end of a long animation. Streams have their own limit: most of the
-    time they wait for their clients, and then use no thread. ``queue`` requests can wait for one of the ``threads``.
-    A request has ``deadline`` seconds after it is admitted.
+    threads. Which shape is next, Turns decides. Streams have their own limit: most of the time they wait for their
+    clients, and then use no thread. ``queue`` requests can wait for one of the ``threads``. A request has ``deadline``
+    seconds after it is admitted.
 
     Attributes:
+        threads: number of threads. Two at least, so that a short call never waits for the end of a long one.
         places, streams: quotas of requests that are admitted, and of answers that are read while they are computed.
         memory: quota of bytes for answers with many shapes.
-        lost: number of abandoned threads that still run.
     """
 
     def __init__(self, threads: int, queue: int, deadline: float) -> None:
-        self.threads, self.deadline = threads, deadline
-        self._pool = self._threads()
-        self._free = asyncio.Semaphore(threads)
+        self.threads, self.deadline = max(2, threads), deadline
+        self._pool = ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
+        self._turns = Turns(self.threads)
         self.places, self.streams = Quota(threads + queue), Quota(threads + queue)
         self.memory = Quota(MEMORY)
-        self.lost = 0
         self._calls: set[Call] = set()
         self._ending = False
-
-    def _threads(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
 
     @asynccontextmanager
     async def admit(self, caller: Caller, advice: str = ADVICE) -> AsyncIterator[Call]:
@@ -139,7 +135,7 @@ class Workers:
 
         The DeadlineError of a late request ends with the advice.
         """
-        with self._place(self.places, caller), self._call(advice) as call:
+        with self._place(self.places, caller), self._call(caller, advice) as call:
             watching = asyncio.create_task(self._watch(caller, call))
             try:
                 yield call
@@ -161,35 +157,34 @@ class Workers:
 
     async def run(self, function: Callable[[Call], T], call: Call) -> T:
         """Run a function of the call in a thread; raises the error of the call if it ends first."""
-        turn = asyncio.ensure_future(self._free.acquire())
+        turn = self._turns.ask(call.caller.client, call.caller.long)
         try:
-            await call.first(turn)
+            await call.first(turn.begun)
+            work = self._pool.submit(copy_context().run, function, call)
         except BaseException:
-            if turn.done() and not turn.cancelled():
-                self._free.release()
+            self._turns.end(turn)
             raise
-        work: Future[T] = self._pool.submit(copy_context().run, function, call)
+        loop = asyncio.get_running_loop()
+        # The turn ends with the work, which may go on for a while after the call has ended.
+        work.add_done_callback(lambda _: None if loop.is_closed() else loop.call_soon_threadsafe(self._turns.end, turn))
         try:
             return await call.first(asyncio.wrap_future(work))
         finally:
-            if work.done() or work.cancel():
-                self._free.release()
-            else:
-                self._abandon(work)
+            work.cancel()
 
     async def map(
-        self, function: Callable[[S, Call], T], items: Iterable[S], call: Call | None
+        self, function: Callable[[S, Call], T], items: Iterable[S], whose: Call | Caller
     ) -> AsyncGenerator[T, None]:
         """Run a function for every item in parallel, and yield the results in order.
 
-        Without a common deadline each item has its own, which starts when the item is submitted.
+        Without a common call each item has its own deadline, which starts when the item is submitted.
         """
         running: deque[asyncio.Task[T]] = deque()
         try:
             for item in items:
                 if len(running) == self.threads:
                     yield await running.popleft()
-                running.append(asyncio.create_task(self.piece(partial(function, item), call)))
+                running.append(asyncio.create_task(self.piece(partial(function, item), whose)))
             while running:
                 yield await running.popleft()
         finally:
@@ -198,11 +193,11 @@ class Workers:
             # asyncio would log other errors as never retrieved.
             await asyncio.gather(*running, return_exceptions=True)
 
-    async def piece(self, function: Callable[[Call], T], call: Call | None) -> T:
-        """Run a function as `run` does, with this deadline or a new one."""
-        if call is not None:
-            return await self.run(function, call)
-        with self._call() as own:
+    async def piece(self, function: Callable[[Call], T], whose: Call | Caller) -> T:
+        """Run a function as `run` does, within a call or in a new one."""
+        if isinstance(whose, Call):
+            return await self.run(function, whose)
+        with self._call(whose) as own:
             return await self.run(function, own)
 
     def late(self, advice: str = ADVICE) -> DeadlineError:
@@ -234,8 +229,8 @@ class Workers:
             quota.give_back(caller.client, amount)
 
     @contextmanager
-    def _call(self, advice: str = ADVICE) -> Iterator[Call]:
-        call = Call(self.deadline, self.late(advice))
+    def _call(self, caller: Caller, advice: str = ADVICE) -> Iterator[Call]:
+        call = Call(caller, self.deadline, self.late(advice))
         self._calls.add(call)
         if self._ending:
             call.give_up(_ending())
@@ -247,31 +242,6 @@ class Workers:
 
     async def _watch(self, caller: Caller, call: Call) -> None:
         call.give_up(await caller.gone())
-
-    def _abandon(self, work: Future[T]) -> None:
-        """Wait for a thread whose call has ended; replace the thread if it doesn't stop."""
-        loop, free = asyncio.get_running_loop(), True
-
-        def lose() -> None:
-            nonlocal free
-            if self.lost < MOST_ABANDONED:
-                free = False
-                self.lost += 1
-                self._pool.shutdown(wait=False)  # running work goes on
-                self._pool = self._threads()
-                self._free.release()
-                text = "a thread is still at work %g s after its deadline, and another takes its place"
-                logger.error(text, GRACE_SECONDS)
-
-        def find() -> None:
-            timer.cancel()
-            if free:
-                self._free.release()
-            else:
-                self.lost -= 1
-
-        timer = loop.call_later(GRACE_SECONDS, lose)
-        work.add_done_callback(lambda _: None if loop.is_closed() else loop.call_soon_threadsafe(find))
 
 
 def _ending() -> EndingError:

@@ -54,7 +54,6 @@ class Metrics:
             ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.places.limit),
             ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
             ("streams_limit", "Such answers that may be; more get 503.", lambda: workers.streams.limit),
-            ("lost_threads", "Threads still at work long after their deadline.", lambda: workers.lost),
             ("connections", "Open connections.", lambda: connections.used),
             ("connections_limit", "Connections that may be open.", lambda: connections.limit),
             ("workers", "Shapes computed at once.", lambda: workers.threads),

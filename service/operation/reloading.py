@@ -9,6 +9,8 @@ from shapespace.service.operation.metrics import Metrics
 from shapespace.service.repository.repository import Changes, ModelRepository
 
 logger = logging.getLogger(__name__)
+#: Seconds from a request for a reload to its beginning, in which further requests count as the same one.
+SETTLE_SECONDS = 0.1
 
 
 class Reloader:
@@ -16,11 +18,16 @@ class Reloader:
 
     def __init__(self, repository: ModelRepository, metrics: Metrics) -> None:
         self._repository, self._metrics = repository, metrics
-        self._lock = asyncio.Lock()
+        self._lock, self._requested = asyncio.Lock(), False
 
     async def reload(self) -> None:
-        """Load the folder as it is now, while requests go on."""
+        """Load the folder as it is now, while requests go on. Further calls before it begins need no reload more."""
+        if self._requested:
+            return
+        self._requested = True
+        await asyncio.sleep(SETTLE_SECONDS)
         async with self._lock:
+            self._requested = False
             try:
                 changes = await asyncio.to_thread(self._repository.reload)
             except Exception:

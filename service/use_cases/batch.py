@@ -41,11 +41,11 @@ class PiecewiseFile:
     It is a context manager; ``held``, its reservation of memory, lasts until the context ends.
     """
 
-    def __init__(self, pieces: Iterator[Buffer], workers: Workers, held: ExitStack) -> None:
-        self._pieces, self._workers, self._held = pieces, workers, held
+    def __init__(self, pieces: Iterator[Buffer], workers: Workers, caller: Caller, held: ExitStack) -> None:
+        self._pieces, self._workers, self._caller, self._held = pieces, workers, caller, held
 
     async def __aiter__(self) -> AsyncGenerator[bytes | memoryview, None]:
-        while (piece := await self._workers.piece(lambda _: next(self._pieces, None), None)) is not None:
+        while (piece := await self._workers.piece(lambda _: next(self._pieces, None), self._caller)) is not None:
             yield piece if isinstance(piece, bytes) else memoryview(piece)
 
     def __enter__(self) -> PiecewiseFile:
@@ -102,9 +102,8 @@ class Batch:
         seconds = {**seconds, "encode": time.perf_counter() - began}
         if isinstance(first, bytes) and self._size <= WHOLE_FILE_BYTES:
             return EncodedFile(first, seconds, diagnostics, facts)
-        return EncodedFile(
-            PiecewiseFile(chain([first], rest), self.workers, self._held.pop_all()), seconds, diagnostics, facts
-        )
+        pieces = PiecewiseFile(chain([first], rest), self.workers, self._call.caller, self._held.pop_all())
+        return EncodedFile(pieces, seconds, diagnostics, facts)
 
 
 @asynccontextmanager

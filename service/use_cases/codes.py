@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -257,7 +257,7 @@ async def _searched(workers: Workers, caller: Caller, advice: str, make: Callabl
         content, seconds = make(call)
         return Found(dump_json(content), seconds)
 
-    async with workers.admit(caller, advice) as call:
+    async with workers.admit(replace(caller, long=True), advice) as call:
         return await workers.run(search, call)
 
 

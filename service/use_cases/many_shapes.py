@@ -45,6 +45,8 @@ from shapespace.solve.deadline import Deadline
 MOST_VERTICES = 2**22
 #: Most bytes of the predictions in one answer. Networks with convolutions need more memory than their outputs.
 MOST_NRIC_BYTES = 2**25
+#: Most codes of an inference that counts as a short call.
+SHORT_INFERENCE = 16
 #: Three coordinates in float32.
 BYTES_PER_VERTEX = 12
 #: Media types of the formats of many shapes, by name; the first is the default.
@@ -86,6 +88,7 @@ async def vertices_file(
     if exponentials:
         require_tangent_space(model.decoder)
     codes, inside = model.latents.codes(latents, bounds)
+    caller = replace(caller, long=exponentials)
     async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
@@ -135,6 +138,7 @@ async def infer(
     )
     if size > BYTES_PER_VERTEX * MOST_VERTICES:
         raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
+    caller = replace(caller, long=len(codes) > SHORT_INFERENCE)
     async with batch(workers, caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
         found: ShapeBatch | None = None
@@ -219,7 +223,7 @@ async def blend_shapes_file(
         return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
 
     with workers.holding(caller, size):
-        async with workers.admit(caller) as call:
+        async with workers.admit(replace(caller, long=True)) as call:
             return await workers.run(make, call)
 
 

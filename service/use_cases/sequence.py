@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncGenerator, Iterator
 from contextlib import aclosing
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -82,6 +83,7 @@ async def sequence_file(
         code, within = colour_by.against
         codes, inside = np.concatenate([codes, code[None]]), np.append(inside, within)
     # Colours take as much memory as positions.
+    caller = replace(caller, long=True)
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
@@ -115,10 +117,11 @@ async def sequence_lines(
 
     frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
     # Each frame has its own deadline, because a stream may take as long as its reader takes.
+    caller = replace(caller, long=True)
     with workers.stream(caller):
         # The first frame is computed alone: in parallel with the second it would take half as long again.
-        yield await workers.piece(partial(line, next(frames)), None)
-        async with aclosing(workers.map(line, frames, None)) as lines:
+        yield await workers.piece(partial(line, next(frames)), caller)
+        async with aclosing(workers.map(line, frames, caller)) as lines:
             async for ready in lines:
                 yield ready
 

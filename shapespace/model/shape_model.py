@@ -28,6 +28,7 @@ from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched,
 from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
+from shapespace.solve.blas_threads import OneBlasThread
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -95,6 +96,7 @@ class ShapeModel:
     'left hip'
     """
 
+    @OneBlasThread()
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
         self.decoder = decoder = Decoder(bundle, threads)
         self.manifest, self.digest, self.reference = decoder.manifest, decoder.digest, decoder.reference
@@ -129,6 +131,7 @@ class ShapeModel:
         """
         return self.decoder.mesh(MeshChoice(mesh))
 
+    @OneBlasThread()
     def shape(
         self,
         code: ArrayLike,
@@ -159,6 +162,7 @@ class ShapeModel:
         given = np.asarray(code, dtype=np.float32)
         return self.decoder.shape(given, inside_bounds, MeshChoice(mesh), deadline, Quality(quality))
 
+    @OneBlasThread()
     def decode(
         self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "full"
     ) -> FloatArray:
@@ -206,6 +210,7 @@ class ShapeModel:
             )
         return positions if values.ndim == 2 else positions[0]
 
+    @OneBlasThread()
     def blend_shapes(self, mesh: MeshName = "fine") -> BlendShapes:
         """Return linear blend shapes: code 0, both ends of each coordinate, and the error against the model.
 
@@ -228,6 +233,7 @@ class ShapeModel:
         choice = MeshChoice(mesh)
         return blend_shapes(self.decoder, choice, lambda code: self.shape(code, mesh=choice))
 
+    @OneBlasThread()
     def encode(
         self,
         mesh: MeshLike | Matched,
@@ -263,6 +269,7 @@ class ShapeModel:
         given = mesh if isinstance(mesh, Matched) else matched(self.decoder, mesh)
         return self._encoder(given, EncodeOptions.of(options, changes), deadline)
 
+    @OneBlasThread()
     def edit(
         self,
         code: ArrayLike,
@@ -302,6 +309,7 @@ class ShapeModel:
         start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
         return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, deadline)
 
+    @OneBlasThread()
     def fit_scan(
         self, scan: ScanLike, options: FitOptions | None = None, *, deadline: Deadline | None = None, **changes: Any
     ) -> Fitted:
@@ -366,6 +374,7 @@ class ShapeModel:
             raise NotFiniteError(f"temperature is {temperature:g}. Give a finite number of at least 0.")
         return self.latents.codes(self.population.sample(count, seed, temperature))[0]
 
+    @OneBlasThread()
     def vertex_uncertainty(self, code: ArrayLike, covariance: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
         """Return the standard deviation (V,) of the vertices of a code's shape, as ``decode`` returns them.
 

@@ -1,4 +1,4 @@
-"""Refusing requests for another host, and requests without the key."""
+"""Refusing requests from pages of other origins, for another host, and without the key."""
 
 from __future__ import annotations
 
@@ -9,20 +9,40 @@ import re
 import time
 from collections import OrderedDict
 from collections.abc import Collection
+from http import HTTPStatus
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
+from starlette.middleware.cors import CORSMiddleware
+from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from shapespace.service.http.middleware.base import HTTPMiddleware, client_of
-from shapespace.service.http.problems import problem
+from shapespace.service.http.middleware.base import HTTPMiddleware, client_of, request_id_of
+from shapespace.service.http.problems import MEDIA_TYPE, description, problem
 
 #: Paths that need no key: health checks of orchestrators, and pages that say nothing about the models.
 OPEN = re.compile(r"/|/page/.*|/openapi\.json|/v2/health/(live|ready)")
 HEALTH = frozenset({"/v2/health/live", "/v2/health/ready"})
-#: After a wrong key: seconds between two checks for its address, so that no key is found by trying; longest time that a
-#: request waits for its check, others get 503 unchecked; and number of addresses that are remembered.
+#: Seconds between two answers to wrong keys of one address; longest time that such an answer waits, while further ones
+#: are 503 at once; and number of addresses that are remembered.
 KEY_INTERVAL, KEY_WAIT, KEY_ADDRESSES = 0.1, 1.0, 10_000
+
+
+class CrossOrigin(CORSMiddleware):
+    """Lets pages of some origins call. Answers of preflights have what all answers have, and refusals are problems."""
+
+    def preflight_response(self, request_headers: Headers) -> Response:
+        """Return the answer to a browser that asks whether a page may send a request."""
+        answer = super().preflight_response(request_headers)
+        if answer.status_code != HTTPStatus.OK:
+            what = bytes(answer.body).decode().removeprefix("Disallowed CORS ")
+            detail = f"Pages may not send this request: its {what} is not allowed. "
+            detail += "SHAPESPACE_CORS_ORIGINS names the origins whose pages may call."
+            body, _ = description("cross-origin", detail)
+            answer = Response(body, answer.status_code, {"Vary": "Origin"}, MEDIA_TYPE)
+        answer.headers["X-Request-ID"] = request_id_of(request_headers)
+        answer.headers["X-Content-Type-Options"] = "nosniff"
+        return answer
 
 
 class RequireHost(HTTPMiddleware):
@@ -58,43 +78,36 @@ class RequireHost(HTTPMiddleware):
 class RequireKey(HTTPMiddleware):
     """Refuses requests without the key, in ``Authorization: Bearer`` or ``X-API-Key``.
 
-    After a wrong key, the next keys from its address have to wait, right or wrong.
+    Answers to wrong keys wait, the right key never does. So nobody can keep the clients of a shared address out. What
+    prevents guesses is the length of the key.
     """
 
     def __init__(self, app: ASGIApp, key: SecretStr) -> None:
         super().__init__(app)
         self._digest = _digest(key.get_secret_value())
-        #: Time at which the next key from an address may be checked.
+        #: Time at which the next wrong key from an address may be answered.
         self._next: OrderedDict[str, float] = OrderedDict()
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on requests that have the key or need none."""
-        if OPEN.fullmatch(scope["path"]):
+        given = _given_key(Headers(scope=scope))
+        # Digests have equal lengths, and comparing them takes the same time wherever they differ.
+        if OPEN.fullmatch(scope["path"]) or hmac.compare_digest(_digest(given), self._digest):
             await self.app(scope, receive, send)
             return
-        if given := _given_key(Headers(scope=scope)):
-            client = client_of(scope)
-            wait = self._next.get(client, 0.0) - time.monotonic()
-            if wait > KEY_WAIT:
-                detail = "Too many wrong keys came from this address. Try again after the time in Retry-After."
-                await problem(scope, "busy", detail)(scope, receive, send)
-                return
-            if wait > 0:
-                self._postpone(client)
-                await asyncio.sleep(wait)
-            # Digests have equal lengths, and comparing them takes the same time wherever they differ.
-            if hmac.compare_digest(_digest(given), self._digest):
-                await self.app(scope, receive, send)
-                return
-            if wait <= 0:
-                self._postpone(client)
-        detail = "Send the server's API key: Authorization: Bearer KEY, or X-API-Key: KEY."
-        await problem(scope, "unauthorized", detail)(scope, receive, send)
-
-    def _postpone(self, client: str) -> None:
-        self._next[client] = max(time.monotonic(), self._next.pop(client, 0.0)) + KEY_INTERVAL
-        if len(self._next) > KEY_ADDRESSES:
-            self._next.popitem(last=False)
+        kind, detail = "unauthorized", "Send the server's API key: Authorization: Bearer KEY, or X-API-Key: KEY."
+        if given:
+            now, client = time.monotonic(), client_of(scope)
+            turn = max(now, self._next.pop(client, 0.0))
+            if turn - now > KEY_WAIT:
+                kind, detail = "busy", "Too many wrong keys came from this address. Send the right key."
+                self._next[client] = turn
+            else:
+                self._next[client] = turn + KEY_INTERVAL
+                await asyncio.sleep(turn - now)
+            if len(self._next) > KEY_ADDRESSES:
+                self._next.popitem(last=False)
+        await problem(scope, kind, detail)(scope, receive, send)
 
 
 def _given_key(headers: Headers) -> str:

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from uuid import uuid4
+
+from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from shapespace.service.limits.quota import client_name
+
+#: Ids that a client may choose; others are replaced.
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 
 
 class HTTPMiddleware:
@@ -23,6 +30,12 @@ class HTTPMiddleware:
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
         raise NotImplementedError
+
+
+def request_id_of(headers: Headers) -> str:
+    """Return the id of a request: its own, if that is a good one, or a new one."""
+    given = headers.get("x-request-id", "")
+    return given if REQUEST_ID.fullmatch(given) else uuid4().hex
 
 
 def client_of(scope: Scope) -> str:

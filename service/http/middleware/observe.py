@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-import re
 import time
 from http import HTTPStatus
-from uuid import uuid4
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import Message, Receive, Scope, Send
 
 from shapespace.service import logs
 from shapespace.service.http.middleware.access import HEALTH
-from shapespace.service.http.middleware.base import HTTPMiddleware
+from shapespace.service.http.middleware.base import HTTPMiddleware, request_id_of
 from shapespace.service.http.problems import problem
 
 #: Named in docs/how-to/operate.md, so that operators can filter by it.
 logger = logging.getLogger("shapespace.service.http.middleware")
-#: Ids that a client may choose; others are replaced.
-REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 #: Most characters of a path in the log.
 LONGEST_PATH = 1000
 #: Paths whose requests are logged at level DEBUG only, because they come every few seconds.
@@ -35,8 +32,7 @@ class Observe(HTTPMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on and watch its answer."""
-        given = Headers(scope=scope).get("x-request-id", "")
-        id = given if REQUEST_ID.fullmatch(given) else uuid4().hex
+        id = request_id_of(Headers(scope=scope))
         context = logs.request_id.set(id)
         service, method = scope["app"].state.service, scope["method"]
         scope = {**scope, "method": "GET"} if method == "HEAD" else scope
@@ -59,6 +55,10 @@ class Observe(HTTPMiddleware):
 
         try:
             await self.app(scope, receive, observed)
+        except asyncio.CancelledError:  # the server ends
+            if not answered:
+                detail = "The server is about to end. Send the request to another one, or again in a moment."
+                await problem(scope, "not-ready", detail)(scope, receive, observed)
         except Exception:
             logger.exception("a mistake of the server")
             if answered:

@@ -165,7 +165,9 @@ def test_what_a_path_allows_is_said_in_the_header_too(client: httpx.Client) -> N
 
 
 def test_refusals_list_the_choices(client: httpx.Client) -> None:
-    choices = client.get(MESH, params={"format": "fbx"}).json()["choices"]
+    answer = client.get(MESH, params={"format": "fbx"})
+    assert "Accept" in answer.headers["Vary"].split(", ")
+    choices = answer.json()["choices"]
     assert {"format": "glb", "media_type": "model/gltf-binary"} in choices
 
 

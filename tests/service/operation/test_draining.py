@@ -1,6 +1,7 @@
 """Shutdown: readiness changes first, and no accepted request is lost."""
 
 import fcntl
+import json
 import os
 import pty
 import signal
@@ -11,13 +12,14 @@ import termios
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
 import pytest
 
 from tests.service.conftest import ROOT, Server, Start
-from tests.service.watching import eventually
+from tests.service.watching import admitted, eventually
 
 MESH = "/v1/models/small/mesh"
 
@@ -128,5 +130,35 @@ def test_an_interrupt_ends_it_at_once_and_cleanly(small_models: Path, start: Sta
     with httpx.Client(base_url=server.url) as client:
         assert client.get("/v2/health/live").status_code == 200
         server.process.send_signal(signal.SIGINT)
+        assert server.process.wait(30) == 0
+    assert "Traceback" not in server.log
+
+
+def test_a_running_stream_is_finished_after_sigterm(small_models: Path, start: Start) -> None:
+    server = start(small_models, drain=60)
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        path = {"keyframes": [[0, 0, 0], [0.1, 0.7, 0.4]], "frames": 600}
+        link = client.post("/v1/models/small/interpolations", json=path).json()["links"]["jsonl"]
+        with client.stream("GET", link) as stream:
+            lines = stream.iter_lines()
+            frames = [json.loads(next(lines))["frame"]]
+            server.process.send_signal(signal.SIGTERM)
+            eventually(lambda: "no longer ready" in server.log)
+            frames += [json.loads(line)["frame"] for line in lines]
+    assert frames == list(range(600))
+    server.process.send_signal(signal.SIGTERM)  # ends the drain
+    assert server.process.wait(60) == 0
+    assert "Traceback" not in server.log
+
+
+def test_an_interrupt_answers_what_runs(small_models: Path, start: Start) -> None:
+    server = start(small_models, max_codes=10_000)
+    with ThreadPoolExecutor(1) as pool, httpx.Client(base_url=server.url, timeout=60) as client:
+        body = {"latents": [[0.1, 0.7, k / 10_000] for k in range(10_000)]}
+        answer = pool.submit(httpx.post, f"{server.url}/v1/models/small/vertices", json=body, timeout=60)
+        eventually(lambda: admitted(client) == 1)
+        server.process.send_signal(signal.SIGINT)
+        assert answer.result().status_code == 503
+        assert answer.result().json()["type"] == "urn:shapespace:problem:not-ready"
         assert server.process.wait(30) == 0
     assert "Traceback" not in server.log

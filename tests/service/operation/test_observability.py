@@ -228,6 +228,12 @@ def test_pages_of_named_origins_may_call(guarded: Server) -> None:
         for origin, allowed in (("https://a.example", True), ("https://b.example", True), ("https://c.example", False)):
             preflight = client.options(MESH, headers={"Origin": origin, **ask})
             assert preflight.is_success is allowed
+            assert preflight.headers["X-Content-Type-Options"] == "nosniff"
+            assert len(preflight.headers["X-Request-ID"]) == 32
+            if not allowed:
+                assert preflight.headers["Content-Type"] == "application/problem+json"
+                assert preflight.json()["type"] == "urn:shapespace:problem:cross-origin"
+                assert "origin is not allowed" in preflight.json()["detail"]
             answer = client.get("/v1/models", headers={"Origin": origin})
             assert (answer.headers.get("Access-Control-Allow-Origin") == origin) is allowed
             assert answer.status_code == 401, "an allowed origin does not replace the key"

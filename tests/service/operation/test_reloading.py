@@ -165,6 +165,26 @@ def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
     assert metrics.registry.get_sample_value("shapespace_reloaded_bundles_total", {"result": "failed"}) == 1
 
 
+def test_requests_for_a_reload_before_it_begins_are_one(tmp_path: Path) -> None:
+    repository, reloads = ModelRepository(tmp_path), 0
+
+    def count() -> Changes:
+        nonlocal reloads
+        reloads += 1
+        return Changes()
+
+    repository.reload = count  # type: ignore[method-assign]
+    reloader = Reloader(repository, Metrics(repository, Workers(1, 0, 1), Quota(10)))
+
+    async def ask(times: int) -> None:
+        await asyncio.gather(*(reloader.reload() for _ in range(times)))
+
+    asyncio.run(ask(20))
+    assert reloads == 1
+    asyncio.run(ask(1))
+    assert reloads == 2
+
+
 #: What ends the children of a killed server is tested in test_sandbox.py too.
 ENDS = [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.long)]
 

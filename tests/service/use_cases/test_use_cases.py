@@ -1,7 +1,9 @@
 """Use cases without HTTP: large files, limits of an answer, and places for other callers."""
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -105,6 +107,41 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
     with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
         ask(["vertices"])
+
+
+def test_long_work_leaves_threads_to_short_work_and_clients_take_turns() -> None:
+    """One client has long work for all threads and more; others come later."""
+
+    async def ask(workers: Workers) -> None:
+        many, other = replace(CALLER, long=True), Caller("somebody else", _stays, long=True)
+        running: list[str] = []
+        go_on = {name: threading.Event() for name in ("m0", "m1", "m2", "m3", "o0", "o1")}
+
+        def hold(name: str) -> Callable[[object], None]:
+            def work(_: object) -> None:
+                running.append(name)
+                assert go_on[name].wait(60)
+
+            return work
+
+        async def started(count: int) -> None:
+            while len(running) < count:
+                await asyncio.sleep(0.01)
+
+        async with asyncio.TaskGroup() as group:
+            for name in go_on:
+                group.create_task(workers.piece(hold(name), many if name[0] == "m" else other))
+            await started(1)
+            for caller in (CALLER, replace(other, long=False)):
+                await workers.piece(lambda _: running.append("short"), caller)
+            assert running == ["m0", "short", "short"], "the other thread runs short work only"
+            for count, name in enumerate(("m0", "o0", "m1", "o1", "m2"), 4):
+                go_on[name].set()
+                await started(count)
+            go_on["m3"].set()
+        assert running[3:] == ["o0", "m1", "o1", "m2", "m3"], "in turn, not in the order of their coming"
+
+    run(ask)
 
 
 def test_one_caller_leaves_places_for_others(model: ShapeModel) -> None:
