@@ -61,9 +61,11 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
             "shapes": shapes,
         }
 
-    cells = served.compared([fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
-    assert cells[:6] == ["3.250", "10.000", "2.000", "10.000", "1.62", "0.50 – 2.00"]
-    assert cells[6:] == ["3.250", "1.62", "0.50 – 2.00"]
+    folds = [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)]
+    for model in (None, served.WITHOUT_EXAMPLES):
+        assert served.average(folds, model) == "3.250 / 10.000"
+        assert served.ratio(folds, model) == "1.62 (0.50 – 2.00)"
+    assert served.average(folds, "components") == "2.000 / 10.000"
 
 
 def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
