@@ -183,6 +183,7 @@ def page(found: list[Collection], runs: Path = RUNS) -> str:
         fewer={"whole": by_name["samba"], "half": collection("samba" + HALF, runs)},
         images=WITH_IMAGES,
         times=times(runs),
+        growth=json.loads((runs / "growth.json").read_text(encoding="utf-8"))["rows"],
     )
 
 

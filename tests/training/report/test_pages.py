@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bundled, fit, generalisation, pages, results, served, verdict
+from benchmarks import bundled, fit, generalisation, pages, results, served, stages, verdict
 
 WRITERS: dict[str, Callable[[], None]] = {
     "bundled": lambda: pages.write("bundled", bundled.page()),
     "fit": fit.write_page,
     "generalisation": generalisation.write_page,
+    "growth": stages.write_page,
     "results": results.write_page,
     "served": served.write_page,
 }
