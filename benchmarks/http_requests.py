@@ -35,10 +35,10 @@ def http(models: Path, count: int, duration: float) -> None:
         print(
             "\nThe first columns are milliseconds by the clock for a GLB of the fine mesh, without a cache. There were"
         )
+        print(f"{requests} requests and {failed} errors. The server was ready {ready:.1f} s after its start, or")
         print(
-            f"{requests} requests and {failed} errors. The server was ready {ready:.1f} s after its start ({used:.1f} s"
+            f"{used:.1f} s of CPU time. It had {memory:.0f} MB of memory then, and {resident(pid):.0f} MB in the end.\n"
         )
-        print(f"of CPU time) with {memory:.0f} MB of memory, and had {resident(pid):.0f} MB in the end.\n")
         print("The first frame of an animation takes about as long as a single frame.\n")
         animations = [[name, *interpolation(client, pid, name, model)] for name, model in names.items()]
         print(table(("60 frames", "first line", "one frame", "frames / s", "frames / CPU s, lines, GLB"), animations))
@@ -89,7 +89,7 @@ def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) 
     for _ in range(9):
         began = time.perf_counter()
         with client.stream("GET", links["jsonl"]) as answer:
-            next(chunk for chunk in answer.iter_raw() if chunk.endswith(b"\n"))
+            next(answer.iter_lines())
             first.append(time.perf_counter() - began)
         time.sleep(0.5)  # for the frames that were begun and that nobody waits for any more
     began, spent = time.perf_counter(), processor(pid)
