@@ -97,7 +97,7 @@ measured.
 ## How it was measured
 
 - Each model was trained on four fifths of the shapes and exported. We did this five times, so that each shape was
-  unseen once. Settings are those of `examples`, without mirror images.
+  unseen once. Settings come from `examples`, without mirror images.
 - Networks learned from at most {joint} joint exponentials and {factors} of each factor.
 - `encode` of the exported model got the fine meshes. Components come from the fine meshes of the same four fifths.
 - No fold chose by its own unseen shapes. The method has been changed with some of them in view: see
@@ -241,7 +241,9 @@ def write_page() -> None:
         title = "" if name.endswith(HALF) else name.replace(MIRRORED, ", with mirror images")
         start = [title, " – ".join(map(str, sorted({min(modes), max(modes)})))]
         unseen, known = ([fold[kind] for fold in found] for kind in COLUMNS)
-        tables["alone"].append([*start, ratio(unseen).partition(" (")[0], ratio(unseen, WITHOUT_EXAMPLES)])
+        tables["alone"].append(
+            [*start, *(ratio(unseen, model).partition(" (")[0] for model in (None, WITHOUT_EXAMPLES))]
+        )
         if not average(unseen):
             continue
         tables["unseen"].append([*start, average(unseen), average(unseen, "components"), ratio(unseen)])
