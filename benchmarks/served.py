@@ -64,7 +64,12 @@ For the other collections, both are about equal.
 {unseen}
 
 The [ratio](../reference/glossary.md#ratio) is our error divided by the error of as many components. In brackets: the
-smallest and the largest ratio of a [fold](../reference/glossary.md#fold).
+smallest and the largest ratio of a [fold](../reference/glossary.md#fold). The last column has the ratio of the same
+model if it does not [remember](../reference/glossary.md#remembers) training shapes (`export.examples = false`). The
+memory helps most with faces and the dancer.
+
+Faces with mirror images were measured before models had a memory. On the first fold, components that know the mirror
+images too have an error of {images} %. The model has {ratio} times as much.
 
 ## Training shapes
 
@@ -73,15 +78,6 @@ Users get their own shapes back almost exactly, because a model [remembers](../r
 {known}
 
 The last column is the same model without its memory. So a small error here does not mean that the modes are better.
-
-## What the memory adds
-
-The memory also helps a little with unseen shapes that resemble a training shape, mostly with faces and the dancer.
-
-{alone}
-
-The setting is `export.examples`. Faces with mirror images were measured before models had a memory. On the first fold,
-components that know the mirror images too have an error of {images} %. The model has {ratio} times as much.
 
 ## Random shapes
 
@@ -235,32 +231,33 @@ def write_page() -> None:
     """Write the page from all stored figures."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
     rows = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
-    tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "alone": [], "first": []}
+    tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
     for name, found in rows.items():
         modes = [fold["modes"] for fold in found]
-        title = "" if name.endswith(HALF) else name.replace(MIRRORED, ", with mirror images")
-        start = [title, " – ".join(map(str, sorted({min(modes), max(modes)})))]
+        count = " – ".join(map(str, sorted({min(modes), max(modes)})))
+        title = f"{name.removesuffix(HALF).replace(MIRRORED, ', with mirror images')}, {count} modes"
         unseen, known = ([fold[kind] for fold in found] for kind in COLUMNS)
-        tables["alone"].append(
-            [*start, *(ratio(unseen, model).partition(" (")[0] for model in (None, WITHOUT_EXAMPLES))]
-        )
+        alone = ratio(unseen, WITHOUT_EXAMPLES).partition(" (")[0]
+        tables["unseen"].append([title, average(unseen), average(unseen, "components"), ratio(unseen), alone])
         if not average(unseen):
             continue
-        tables["unseen"].append([*start, average(unseen), average(unseen, "components"), ratio(unseen)])
         alone = average(known, WITHOUT_EXAMPLES, ("mean",))
-        tables["known"].append([*start, average(known), average(known, "components"), alone])
-        tables["first"].append([*start, *(f"{100 * figure:.2f}" for figure in found[0]["specificity"])])
+        tables["known"].append([title, average(known), average(known, "components"), alone])
+        tables["first"].append([title, *(f"{100 * figure:.2f}" for figure in found[0]["specificity"])])
     first = rows["faces" + MIRRORED][0]
     images = first["mirrored_components"]["mean"]
-    heads = {"unseen": ("our error", "components", "ratio"), "known": ("our error", "components", "without memory")}
-    heads |= {"alone": ("ratio", "ratio without memory"), "first": ("our random shapes", "of components")}
+    heads = {
+        "unseen": ("our error", "components", "ratio", "without memory"),
+        "known": ("our error", "components", "without memory"),
+        "first": ("our random shapes", "of components"),
+    }
     page = PAGE.format(
         joint=JOINT,
         factors=OF_FACTORS,
         codes=RANDOM,
         images=f"{100 * images:.3f}",
         ratio=f"{first[COLUMNS[0]][WITHOUT_EXAMPLES]['mean'] / images:.2f}",
-        **{kind: table(("", "modes", *heads[kind]), cells) for kind, cells in tables.items()},
+        **{kind: table(("", *heads[kind]), cells) for kind, cells in tables.items()},
     )
     pages.write("served", page)
 

@@ -50,7 +50,7 @@ BANDED = 5000
 PAGE = """# Serving
 
 How long does the server take for a shape, where does the time go, and how does it grow? A shape of the figure takes
-about ten milliseconds of one core. [Performance](performance.md) says why it is as fast as it is.
+about ten milliseconds of one core. [The notes](../../benchmarks/NOTES.md#performance) say why it is as fast as it is.
 
 Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu-time) of one thread in milliseconds,
 medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day}; the
@@ -238,10 +238,6 @@ def _starts(model: ShapeModel, codes: Codes) -> list[str]:
 
 def growth(count: int) -> None:
     """Print the growth of times with the number of vertices and with the dimension."""
-    said = {
-        "V": "The time grows faster than the number of coarse vertices V: larger meshes need more steps too.",
-        "m": "The number of modes m changes it little.",
-    }
     print("\n## Growth")
     largest = 0.0
     with tempfile.TemporaryDirectory() as folder:
@@ -263,10 +259,11 @@ def growth(count: int) -> None:
                 solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
                 ratio = f"{median['sum'] / median['SuperLU']:.2f}"
                 found.append([size, ms(median["network"]), solved, ms(median["sum"]), ratio])
-            print(f"\n{said[kind]}\n")
-            print(table((kind, "networks", "reconstruction (steps)", "sum", "sum / SuperLU"), found))
+            if kind == "V":
+                print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.\n")
+                print(table((kind, "networks", "reconstruction (steps)", "sum", "sum / SuperLU"), found))
             power = np.polyfit(np.log(sizes), np.log(sums), 1)[0]
-            print(f"\nThe sum grows like {kind}^{power:.2f}, by least squares in logarithms.")
+            print(f"\nFrom {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
     print(f"The shapes are synthetic capsules. This process had up to {largest:.0f} MB.")
 
 

@@ -13,7 +13,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import trimesh
@@ -77,7 +77,7 @@ class Size:
     modes: int = 8
     coarse: int = 500
 
-    def beside(self, base: Size) -> str:
+    def beside(self, base: Self) -> str:
         """Say in words where this size differs from another."""
         words = {"fine": "vertices in a file", "coarse": "coarse vertices"}
         own, others = asdict(self), asdict(base)

@@ -4,8 +4,6 @@ The command trains nothing. A simple model that ``runs/collections/NAME.json`` h
 under a key of its own in ``unseen``, is compared without any change here: the best of them has a bar.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,7 +40,7 @@ TIMED = ("hand-one-factor", "samba-few", "makehuman")
 
 
 @dataclass
-class Collection:
+class CollectionErrors:
     """Mean vertex errors for unseen shapes, as shares of the bounding box's diagonal.
 
     Attributes:
@@ -72,7 +70,7 @@ class Collection:
         return min(self.ratios, key=lambda name: self.ratios[name], default=None)
 
 
-def collection(name: str, runs: Path = RUNS) -> Collection:
+def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
     """Read the figures of one collection: all its folds, and what other runs say about simple models."""
     folds = json.loads((runs / "collections" / f"{name}.json").read_text(encoding="utf-8"))
     unseen = [fold["unseen"] for fold in folds]
@@ -81,7 +79,7 @@ def collection(name: str, runs: Path = RUNS) -> Collection:
     def mean(some: list[dict[str, Any]]) -> float:
         return float(np.average([each["mean"] for each in some], weights=shapes))
 
-    found = Collection(
+    found = CollectionErrors(
         name,
         shapes=sum(shapes),
         modes=max(fold["modes"] for fold in folds),
@@ -98,7 +96,7 @@ def collection(name: str, runs: Path = RUNS) -> Collection:
 
 
 @dataclass
-class Time:
+class TrainingTime:
     """Size of a training run, and the minutes that it took."""
 
     title: str
@@ -108,7 +106,7 @@ class Time:
     minutes: float
 
 
-def times(runs: Path = RUNS) -> list[Time]:
+def times(runs: Path = RUNS) -> list[TrainingTime]:
     """Return the times of whole runs, from the shortest to the longest."""
     found = []
     for name in TIMED:
@@ -116,18 +114,20 @@ def times(runs: Path = RUNS) -> list[Time]:
         counts, ingest = run["drawn"], run["ingest"]
         computed = counts["joint"] + counts["of factors"]
         title = TITLES[name.partition("-")[0]]
-        found.append(Time(title, ingest["shapes"], ingest["vertices"], computed, sum(run["seconds"].values()) / 60))
+        found.append(
+            TrainingTime(title, ingest["shapes"], ingest["vertices"], computed, sum(run["seconds"].values()) / 60)
+        )
     log = [json.loads(line) for line in (runs / "figure" / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     ingested = next(line for line in log if line["event"] == "ingested")
     # Later calls of the same run repeat single stages.
     seconds = {line["stage"]: line["seconds"] for line in reversed(log) if line["event"] == "end"}
     computed = json.loads((runs / "figure" / "evaluation.json").read_text(encoding="utf-8"))["exponentials"]
     minutes = sum(seconds.values()) / 60
-    found.append(Time(TITLES["figure"], ingested["shapes"], ingested["vertices"], computed, minutes))
+    found.append(TrainingTime(TITLES["figure"], ingested["shapes"], ingested["vertices"], computed, minutes))
     return sorted(found, key=lambda run: run.minutes)
 
 
-def drawing(found: list[Collection]) -> Figure:
+def drawing(found: list[CollectionErrors]) -> Figure:
     """Draw the bars of all collections: the model, the components, and the best simple model."""
     figure = Figure(figsize=(7.2, 0.62 * len(found) + 1.1), layout="constrained")
     axes: Axes = figure.subplots()
@@ -154,7 +154,7 @@ def drawing(found: list[Collection]) -> Figure:
     return figure
 
 
-def draw(found: list[Collection], path: Path = CHART) -> None:
+def draw(found: list[CollectionErrors], path: Path = CHART) -> None:
     """Write the chart as SVG, with the same bytes for the same figures."""
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": path.name, "font.size": 9}):
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
@@ -166,7 +166,7 @@ def listed(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
-def page(found: list[Collection], runs: Path = RUNS) -> str:
+def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
     """Return the text of the page."""
     by_name = {each.name: each for each in found}
     rivals = dict.fromkeys(each.best for each in found if each.best)
@@ -187,7 +187,7 @@ def page(found: list[Collection], runs: Path = RUNS) -> str:
     )
 
 
-def collections(runs: Path = RUNS) -> list[Collection]:
+def collections(runs: Path = RUNS) -> list[CollectionErrors]:
     """Return all collections, from the largest gain to the smallest."""
     return sorted((collection(name, runs) for name in TITLES), key=lambda each: each.ratio)
 
