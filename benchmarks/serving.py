@@ -50,7 +50,8 @@ BANDED = 5000
 PAGE = """# Serving
 
 How long does the server take for a shape, where does the time go, and how does it grow? A shape of the figure takes
-about ten milliseconds of one core. [The notes](../../benchmarks/NOTES.md#performance) say why it is as fast as it is.
+about ten milliseconds of one core. [benchmarks/NOTES.md](../../benchmarks/NOTES.md#performance) says why it is as fast
+as it is.
 
 Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu-time) of one thread in milliseconds,
 medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day}; the
