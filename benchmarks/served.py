@@ -193,7 +193,9 @@ def average(folds: list[dict[str, Any]], model: str | None = None, keys: tuple[s
     if "mean" not in some[0]:
         return ""
     weights = [fold["shapes"] for fold in folds]
-    return " / ".join(f"{100 * np.average([each[key] for each in some], weights=weights):.3f}" for key in keys)
+    return "\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}".join(
+        f"{100 * np.average([each[key] for each in some], weights=weights):.3f}" for key in keys
+    )
 
 
 def ratio(folds: list[dict[str, Any]], model: str | None = None) -> str:
@@ -204,7 +206,7 @@ def ratio(folds: list[dict[str, Any]], model: str | None = None) -> str:
     found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(some, folds, strict=True)])
     mean, components = np.average(found, axis=0, weights=[fold["shapes"] for fold in folds])
     each = found[:, 0] / found[:, 1]
-    return f"{mean / components:.2f}" + (f" ({each.min():.2f} – {each.max():.2f})" if folds[1:] else "")
+    return f"{mean / components:.2f}" + (f" ({each.min():.2f}–{each.max():.2f})" if folds[1:] else "")
 
 
 def main() -> None:

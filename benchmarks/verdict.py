@@ -28,7 +28,7 @@ TITLES = {
     "samba": "a captured dancer",
     "hippocampus": "hippocampi",
 }
-#: A model with less than this share of the components' error pays for its training.
+#: A model pays for its training if it has less than this share of the error of the best simple model.
 PAYS = 0.7
 #: Figures beside the errors of simple models in a fold: our own errors, and the number of shapes.
 OURS = ("mean", "p95", "shapes", "nothing remembered")
@@ -63,6 +63,11 @@ class CollectionErrors:
     def ratio(self) -> float:
         """The model's error as a share of the components' error."""
         return self.error / self.components
+
+    @property
+    def pays(self) -> bool:
+        """Whether the model is clearly better than every simple model."""
+        return self.ratio < PAYS * min([1.0, *self.ratios.values()])
 
     @property
     def best(self) -> str | None:
@@ -173,8 +178,8 @@ def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
     return pages.render(
         "verdict",
         every=found,
-        better=[each for each in found if each.ratio < PAYS],
-        equal=[each for each in found if each.ratio >= PAYS],
+        better=[each for each in found if each.pays],
+        equal=[each for each in found if not each.pays],
         beside=[(name, [each for each in found if each.best == name]) for name in rivals],
         titles=lambda some: listed([each.title for each in some]),
         range=lambda some: f"{min(each.ratio for each in some):.2f} to {max(each.ratio for each in some):.2f}",

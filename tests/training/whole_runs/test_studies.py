@@ -63,9 +63,9 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
 
     folds = [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)]
     for model in (None, served.WITHOUT_EXAMPLES):
-        assert served.average(folds, model) == "3.250 / 10.000"
-        assert served.ratio(folds, model) == "1.62 (0.50 – 2.00)"
-    assert served.average(folds, "components") == "2.000 / 10.000"
+        assert served.average(folds, model) == "3.250\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}10.000"
+        assert served.ratio(folds, model) == "1.62 (0.50–2.00)"
+    assert served.average(folds, "components") == "2.000\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}10.000"
 
 
 def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
