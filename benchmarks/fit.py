@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
@@ -40,71 +39,6 @@ VARIANTS = ("whole", "noisy", "camera")
 COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
 #: Stored figures, one file for each model.
 FIGURES = ROOT / "runs" / "fit"
-
-PAGE = """# Fits of scans
-
-How near does `fit` come to the true shape, how often does it fail, and does it notice? Every scan here was sampled from
-a shape whose vertices are known, turned at random and moved. Errors are in percent of the
-[diagonal](../reference/glossary.md#diagonal).
-
-## Unseen shapes
-
-The error of `fit` is smaller than the error of fitted principal components for all poses. It is a little smaller for
-faces, and equal for hippocampi.
-
-{unseen}
-
-Each cell has our error, and behind the stroke the error of the components. `encode` gets the vertices in their order,
-so the model allows no smaller error. Hands seen by one camera and posed bodies (makehuman) leave the most to gain.
-
-## Shapes of the model
-
-If the model can make the shape exactly, errors are below 0.11 % without noise and below 0.23 % with noise.
-
-{drawn}
-
-*drawn*: shapes of random codes of the population. *training*: shapes that made the model. For the torus the distance is
-the one of its surface, because four of its codes have the same surface.
-
-## Failed fits
-
-The `status` tells {noticed} of {lost} failed fits. Horses fail most, and the torus raises many false alarms.
-
-{failures}
-
-A fit has **failed** if its error exceeds {failed:g} times the median of its kind and {far:.0%} of the diagonal. It is
-**noticed** if its status is not `converged`. **False alarms** are good fits whose status is not `converged`. Unseen
-horses fail in {horses[1]} of {horses[0]} tries.
-
-## Time
-
-A fit takes as long as {low:.0f} to {high:.0f} shapes, and {middle:.0f} at the median.
-
-These are medians of the kinds of scans. The slowest are hands seen by one camera.
-
-## Intervals
-
-With noise, the 90 % intervals of a code contain the truth about as often as they should. Without noise they are often
-too narrow.
-
-{intervals}
-
-Each cell is the share of coordinates within their [interval](../reference/glossary.md#interval), over all fits that
-converged. In brackets: the width of the interval as a share of the width for the population. For the torus intervals do
-not hold. A fit finds one of four codes with the same surface, and its interval does not know the other three.
-
-## How it was measured
-
-- **whole**: alternately {points} points all over the shape, and a decimated mesh of jittered vertices.
-- **noisy**: {points} points with noise of {noise:.1%} of the diagonal and {outliers:.0%} outliers.
-- **one camera**: at most {points} points that a camera sees, with the same noise, and `partial=true`.
-- Errors and times are medians over {tries}. Unseen figures are new poses of its generator. Other unseen shapes
-  are the fifth that was left out in the first fold of [served models](served.md).
-- **components**: the usual alternative, an iterated closest-point fit with as many principal components of the training
-  shapes. It begins with the mean shape at the place that `fit` has found, which helps it. Scans of {choosing} training
-  shapes choose how strongly it holds on to the mean.
-- `python -m benchmarks.fit` measures, `--page` only writes this page. Every try is in `runs/fit/`.
-"""
 
 
 @dataclass
@@ -300,11 +234,14 @@ def middle(values: list[float]) -> str:
     return f"{100 * float(np.median(values)):.3f}"
 
 
-def failures(row: Row) -> NDArray[np.int_]:
+def failures(*rows: Row) -> list[int]:
     """Count tries, failures, failures with a status that says so, and false alarms."""
-    errors, converged = np.array(row.errors), np.array(row.converged)
-    failed = errors > max(FAILED * np.median(errors), FAR)
-    return np.array([len(errors), failed.sum(), (failed & ~converged).sum(), (~failed & ~converged).sum()])
+    counts = np.zeros(4, int)
+    for row in rows:
+        errors, converged = np.array(row.errors), np.array(row.converged)
+        failed = errors > max(FAILED * np.median(errors), FAR)
+        counts += [len(errors), failed.sum(), (failed & ~converged).sum(), (~failed & ~converged).sum()]
+    return [int(count) for count in counts]
 
 
 def held(row: Row) -> str:
@@ -348,14 +285,15 @@ def write_page() -> None:
     others = {f"{name}, {kind}": rows for (name, kind), rows in every.items() if kind != "unseen"}
     models = {name: [row for (other, _), rows in every.items() if other == name for row in rows] for name in files}
     spent = [float(np.median(row.seconds)) for rows in models.values() for row in rows]
-    _, lost, noticed, _ = sum(failures(row) for rows in every.values() for row in rows)
+    _, lost, noticed, _ = failures(*(row for rows in every.values() for row in rows))
     scans = "whole", "noisy", "one camera"
     counts = sorted({len(row.errors) for rows in every.values() for row in rows})
 
     def both(row: Row) -> str:
         return f"{middle(row.errors)} / {middle(row.components)}"
 
-    page = PAGE.format(
+    page = pages.render(
+        "fit",
         points=POINTS,
         noise=NOISE,
         outliers=OUTLIERS,
@@ -365,7 +303,7 @@ def write_page() -> None:
         tries=f"{counts[0]} to {counts[-1]} tries of each kind",
         lost=lost,
         noticed=noticed,
-        horses=sum(map(failures, every["horse", "unseen"])),
+        horses=failures(*every["horse", "unseen"]),
         unseen=table(
             ("", *scans, "`encode`"),
             ([name, *map(both, rows), middle(rows[0].encoded)] for name, rows in unseen.items()),
@@ -373,7 +311,7 @@ def write_page() -> None:
         drawn=table(("", *scans), ([name, *(middle(row.errors) for row in rows)] for name, rows in others.items())),
         failures=table(
             ("", "tries", "failed", "noticed", "false alarms"),
-            ([name, *map(str, sum(map(failures, rows)))] for name, rows in models.items()),
+            ([name, *map(str, failures(*rows))] for name, rows in models.items()),
         ),
         low=min(spent),
         middle=np.median(spent),
