@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from benchmarks.pages import print_head, print_row
+from benchmarks.pages import table
 from benchmarks.processes import server
 
 
@@ -44,10 +44,13 @@ def main() -> None:
         time.sleep(1)
         beside = shapes(client, given.seconds)
         over.set()
-        print_head("torus, ms | requests | p50 | p99")
-        for name, times in (("alone", alone), (f"beside {given.fits} fits", beside)):
-            print_row(name, len(times), *(float(np.quantile(times, q)) for q in (0.5, 0.99)))
-        print_row("ratio", "", *(f"{np.quantile(beside, q) / np.quantile(alone, q):.2f}" for q in (0.5, 0.99)))
+        quantiles = 0.5, 0.99
+        rows = [
+            [name, str(len(times)), *(f"{1e3 * np.quantile(times, q):.0f}" for q in quantiles)]
+            for name, times in (("alone", alone), (f"beside {given.fits} fits", beside))
+        ]
+        ratios = (f"{np.quantile(beside, q) / np.quantile(alone, q):.2f}" for q in quantiles)
+        print(table(("torus, ms", "requests", "p50", "p99"), [*rows, ["ratio", "", *ratios]]))
 
 
 def shapes(client: httpx.Client, seconds: float) -> list[float]:

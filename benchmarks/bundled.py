@@ -21,13 +21,13 @@ from shapespace.training.runs.config import load
 
 #: Models of `evaluation.json` in the order of the tables, in words.
 MODELS = {
-    "composite": "**composite**",
-    "monolithic": "our recipe with all coordinates in one factor, from the same joint samples",
-    "kernel": "kernel ridge regression on the codes, likewise",
+    "composite": "**our model**",
+    "monolithic": "our recipe, one factor",
+    "kernel": "kernel ridge regression",
     "paper": "the paper's own system",
     "monolithic_paper": "the paper's monolithic network",
-    "affine": "affine sum of exact factors",
-    "affine of learned factors": "affine sum of learned factors",
+    "affine": "affine sum, exact factors",
+    "affine of learned factors": "affine sum, learned factors",
     "grid": "multilinear grid of each factor",
 }
 

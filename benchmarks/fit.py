@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from benchmarks import pages
-from benchmarks.pages import ROOT
+from benchmarks.pages import ROOT, table
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
@@ -39,46 +39,6 @@ VARIANTS = ("whole", "noisy", "camera")
 COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
 #: Stored figures, one file for each model.
 FIGURES = ROOT / "runs" / "fit"
-
-PAGE = """# Fits of scans
-
-How near `fit` comes to a shape whose vertices are known, from a scan without correspondence: each shape is sampled
-anew, turned at random and moved. **whole**: alternately {points} points all over, and a decimated mesh of jittered
-vertices. **noisy**: {points} points with noise of {noise:.1%} of the bounding box's diagonal and {outliers:.0%}
-outliers. **camera**: at most so many points, those that one camera sees, with the same noise, and `partial=true`.
-**unseen** shapes of the figure are poses from its generator that no training knows, those of the collections the fifth
-that was left out of their training ([served.md](served.md), whose first folds these models are); **training** ones
-those that made the model, **drawn** ones shapes of the population's codes. `python -m benchmarks.fit` measures and
-writes this page; what it measured, every try of it, is in `runs/fit/`.
-
-**error**: median over tries of the mean distance of vertices from the truth, in percent of the diagonal; of the torus
-the distance of its surface, which four codes share in as many places, each with other vertices. **encode**: the same
-of `encode`, which is given the vertices in their order. **failed**: tries further off than {failed:g} times the median
-of their row and than {far:.0%} of the diagonal. **told**: those of them whose status is not `converged`. **false
-alarms**: others whose status is not.
-**shapes**: solved ones at the median, three rough ones counted as one; **time**: in solved shapes. **components**:
-the usual alternative, an iterated closest-point fit with as many principal components of the training shapes, as the
-model remembers them. It begins with the mean shape, placed as `fit` has found it, which helps it; how strongly it
-holds on to the mean is chosen for each kind of scan by scans of {choosing} training shapes, each with components of the
-others.
-
-| model | shapes | scan | tries | error | encode | ratio | failed | told | false alarms | shapes | time | components |
-|---|---|---|---|---|---|---|---|---|---|---|---|---|
-{rows}
-
-## Intervals
-
-How often the code's 90 % intervals hold the truth's coordinates, over all coordinates of all fits that converged, and
-the intervals' median width as a share of the population's. Of shapes drawn from the model the truth is their code; of
-training shapes it is `encode`'s code. Four codes of the torus have the same surface up to the networks' errors: after
-half a turn about its axis gamma is another by π, and upside down all signs are. A fit finds one of them or another
-nearby, and its covariance does not know of the others: there the intervals do not hold. Elsewhere they are too narrow
-where a row has much less than 90 %, as those of scans without noise.
-
-| model | shapes | scan | fits | held | width |
-|---|---|---|---|---|---|
-{intervals}
-"""
 
 
 @dataclass
@@ -269,34 +229,24 @@ class Bench:
         row.widths.append(float(np.median(deviations / np.sqrt(self.model.population.covariance.diagonal()))))
 
 
-def line(name: str, row: Row) -> str:
-    """Return a row of the table of errors."""
-    errors, converged = np.array(row.errors), np.array(row.converged)
-    failed = errors > max(FAILED * np.median(errors), FAR)
-    encoded = 100 * float(np.median(row.encoded)) if row.encoded else None
-    middle = 100 * float(np.median(errors))
-    cells = [
-        name,
-        row.kind,
-        row.variant,
-        str(len(errors)),
-        f"{middle:.3f}",
-        "–" if encoded is None else f"{encoded:.3f}",
-        "–" if encoded is None else f"{middle / encoded:.2f}",
-        str(int(failed.sum())),
-        str(int((failed & ~converged).sum())),
-        str(int((~failed & ~converged).sum())),
-        f"{np.median(row.shapes):.0f}",
-        f"{np.median(row.seconds):.0f}",
-        f"{100 * float(np.median(row.components)):.3f}" if row.components else "–",
-    ]
-    return pages.row(cells)
+def middle(values: list[float]) -> str:
+    """Return the median of shares in percent, without the sign."""
+    return f"{100 * float(np.median(values)):.3f}"
 
 
-def held(name: str, row: Row) -> str:
-    """Return a row of the table of intervals."""
-    figures = [f"{np.mean(row.held):.0%}", f"{np.median(row.widths):.3f}"] if row.held else ["–", "–"]
-    return pages.row([name, row.kind, row.variant, str(len(row.held)), *figures])
+def failures(*rows: Row) -> list[int]:
+    """Count tries, failures, failures with a status that says so, and false alarms."""
+    counts = np.zeros(4, int)
+    for row in rows:
+        errors, converged = np.array(row.errors), np.array(row.converged)
+        failed = errors > max(FAILED * np.median(errors), FAR)
+        counts += [len(errors), failed.sum(), (failed & ~converged).sum(), (~failed & ~converged).sum()]
+    return [int(count) for count in counts]
+
+
+def held(row: Row) -> str:
+    """Return a cell: the share of coordinates within their intervals, and the width of these."""
+    return f"{np.mean(row.held):.0%} ({np.median(row.widths):.3f})" if row.held else "–"
 
 
 def kinds(
@@ -319,7 +269,7 @@ def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int)
     found = []
     for kind, shapes, codes in every:
         for row in bench.tries(kind, shapes, codes):
-            print(line(name, row), held(name, row), sep="\n", flush=True)
+            print(name, kind, row.variant, middle(row.errors), flush=True)
             found.append(row)
     return found
 
@@ -327,16 +277,46 @@ def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int)
 def write_page() -> None:
     """Write the page from all stored figures."""
     files = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in sorted(FIGURES.glob("*.json"))}
-    rows = [(name, Row(**each)) for name, found in files.items() for each in found]
-    page = PAGE.format(
+    every: dict[tuple[str, str], list[Row]] = {}
+    for name, found in files.items():
+        for row in (Row(**each) for each in found):
+            every.setdefault((name, row.kind), []).append(row)
+    unseen = {name: rows for (name, kind), rows in every.items() if kind == "unseen"}
+    others = {f"{name}, {kind}": rows for (name, kind), rows in every.items() if kind != "unseen"}
+    models = {name: [row for (other, _), rows in every.items() if other == name for row in rows] for name in files}
+    spent = [float(np.median(row.seconds)) for rows in models.values() for row in rows]
+    _, lost, noticed, _ = failures(*(row for rows in every.values() for row in rows))
+    scans = "whole", "noisy", "one camera"
+    counts = sorted({len(row.errors) for rows in every.values() for row in rows})
+
+    def both(row: Row) -> str:
+        return f"{middle(row.errors)} / {middle(row.components)}"
+
+    page = pages.render(
+        "fit",
         points=POINTS,
         noise=NOISE,
         outliers=OUTLIERS,
         failed=FAILED,
         far=FAR,
         choosing=CHOOSING,
-        rows="\n".join(line(name, row) for name, row in rows),
-        intervals="\n".join(held(name, row) for name, row in rows if row.kind != "unseen"),
+        tries=f"{counts[0]} to {counts[-1]} tries of each kind",
+        lost=lost,
+        noticed=noticed,
+        horses=failures(*every["horse", "unseen"]),
+        unseen=table(
+            ("", *scans, "`encode`"),
+            ([name, *map(both, rows), middle(rows[0].encoded)] for name, rows in unseen.items()),
+        ),
+        drawn=table(("", *scans), ([name, *(middle(row.errors) for row in rows)] for name, rows in others.items())),
+        failures=table(
+            ("", "tries", "failed", "noticed", "false alarms"),
+            ([name, *map(str, failures(*rows))] for name, rows in models.items()),
+        ),
+        low=min(spent),
+        middle=np.median(spent),
+        high=max(spent),
+        intervals=table(("", *scans), ([name, *map(held, rows)] for name, rows in others.items())),
     )
     pages.write("fit", page)
 

@@ -21,30 +21,43 @@ from shapespace.training.stages.ingest import ingest
 #: Stored figures, one file for each collection.
 FIGURES = ROOT / "runs" / "folds"
 
-INTRODUCTION = """# Shapes that a space has not seen
+PAGE = """# Unseen shapes, by modes alone
 
-Distance of a vertex from its place after rigid alignment, in percent of the bounding box's diagonal: mean and 95th
-percentile over all vertices of all shapes, each held out in one of five folds that found mean, logarithms and modes
-without it. **Modes**: the code whose exponential comes closest in vertices, in **K** time steps, {steps} or as the
-folds chose; no networks.
-**Components**: principal components of the aligned vertices, as many. On coarse meshes of at most a thousand vertices.
-Rows *with mirror images* also learn from the images of the shapes that they know, which a symmetric shape of the
-collection gives, on another coarse mesh; components are without and, in the last columns, with them too.
-No fold chooses on its own held-out shapes: settings are those of `examples`, and each fold chooses K, and sparsity
-where the settings leave it open, by the shapes that it knows. But how modes are found was settled with such folds in
-view ([how we know](../explanation/how-we-know.md#which-choice-was-made-on-which-data)), and the rule for K was changed
-twice after ([notes](notes.md#why-faces-are-no-nearer-than-components)). Rows of samba and of makehuman were measured
-with K = 8 before K could be chosen.
+How near can the modes of a collection come to a shape that they were found without? This page has the answer for exact
+[exponentials](../reference/glossary.md#exponential). [Served models](served.md) has it for networks, which users meet.
 
-Makehuman is further away here than [served networks](served.md) are: some of its poses lie where exponentials end, as
-faces collapse on the way, and networks go on there ([notes](notes.md#where-exponentials-end)). The ratios of its rows
-are upper bounds.
+## Modes and principal components
 
-`python -m benchmarks.generalisation --data FOLDER` measures and writes this page; a collection is in
-it once all its folds are measured, with figures in `runs/folds/`.
+For poses of hands and of the figure, modes leave much less than as many principal components; elsewhere about as much.
 
-| | shapes | m | K | modes: mean | 95 % | components: mean | 95 % | ratio | components with images: mean | ratio |
-|---|---|---|---|---|---|---|---|---|---|---|
+{plain}
+
+The error is the mean distance of a vertex from its place, in percent of the
+[diagonal](../reference/glossary.md#diagonal). The [ratio](../reference/glossary.md#ratio) is the error of modes divided
+by the error of components. Each collection has two rows: with half of its modes and with all.
+
+## With mirror images
+
+Mirror images of the training shapes help modes and components alike on posed bodies; modes stay ahead there.
+
+{mirrored}
+
+Here modes also come from the [mirror images](../reference/glossary.md#mirror-image) of the training shapes. The ratio
+is to the components that know these images too.
+
+## How it was measured
+
+- Five [folds](../reference/glossary.md#fold): each shape is left out once, and mean, logarithms and modes come from the
+  other shapes. The error is of the nearest exponential to the shape left out, after rigid alignment.
+- Meshes are coarse, with at most a thousand vertices. Rows with mirror images have another coarse mesh.
+- K is the number of [time steps](../reference/glossary.md#time-steps): {steps}, or 1 where a fold chose it. The dancer
+  (samba) and the posed bodies (makehuman) were measured before a fold could choose.
+- No fold chooses by its own unseen shapes. The method itself was changed with such folds in view: see
+  [how we know](../explanation/how-we-know.md#which-choice-was-made-on-which-data).
+- For makehuman the ratios are upper bounds. Some of its poses lie where exponentials end, because faces collapse on the
+  way; [served networks](served.md) go on there and come nearer.
+- `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles, are
+  in `runs/folds/`.
 """
 #: Rows of the table.
 ROWS = tuple(
@@ -89,34 +102,34 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     }
 
 
-def title(name: str) -> str:
-    """Return the title of a row."""
-    return name.replace(MIRRORED, ", with mirror images")
-
-
-def beside_images(own: dict[str, float], images: dict[str, float] | None) -> list[str]:
-    """Return the last cells of a row: error of components with mirror images, and the ratio to it, if measured."""
-    return [f"{100 * images['mean']:.3f}", f"{own['mean'] / images['mean']:.2f}"] if images else ["", ""]
-
-
-def rows(name: str, found: dict[str, Any]) -> list[str]:
-    """Return the rows of a collection."""
-    result: list[str] = []
-    mirrored = found.get("mirrored_components", [None] * len(found["counts"]))
-    each = zip(found["counts"], found["modes"], found["components"], mirrored, strict=True)
-    for count, own, other, images in each:
-        figures = [f"{100 * figure:.3f}" for figure in (own["mean"], own["p95"], other["mean"], other["p95"])]
-        cells = [
-            "" if result else title(name),
-            str(found["shapes"]),
-            str(count),
-            ", ".join(map(str, found["steps"])),
-            *figures,
-            f"{own['mean'] / other['mean']:.2f}",
-        ]
-        cells += beside_images(own, images)
-        result.append(pages.row(cells))
+def rows(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[list[str]]:
+    """Return the rows of a collection: modes beside components, for each number of modes; the ratio is to the first."""
+    result: list[list[str]] = []
+    each = zip(found["counts"], found["modes"], *(found[other] for other in others), strict=True)
+    for count, own, *components in each:
+        title = f"{name}, K = {', '.join(map(str, found['steps']))}"
+        errors = [f"{100 * some['mean']:.3f} %" for some in (own, *components)]
+        result.append([f"{title}, {count} modes", *errors, f"{own['mean'] / components[0]['mean']:.2f}"])
     return result
+
+
+def write_page() -> None:
+    """Write the page from all stored figures."""
+    done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
+    plain = {name: found for name, found in done.items() if not name.endswith(MIRRORED)}
+    images = {name.removesuffix(MIRRORED): found for name, found in done.items() if "mirrored_components" in found}
+    page = PAGE.format(
+        plain=pages.table(
+            ("", "error of modes", "of components", "ratio"),
+            (row for name, found in plain.items() for row in rows(name, found, ("components",))),
+        ),
+        mirrored=pages.table(
+            ("", "error of modes", "of components with images", "of components without", "ratio to those with"),
+            (row for name, found in images.items() for row in rows(name, found, ("mirrored_components", "components"))),
+        ),
+        steps=LIGHT_STEPS,
+    )
+    pages.write("generalisation", page)
 
 
 def main() -> None:
@@ -132,10 +145,7 @@ def main() -> None:
             found = measure(name, given.data, given.out)
             file.parent.mkdir(exist_ok=True)
             file.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
-        table = "\n".join(row for each in done.items() for row in rows(*each))
-        page = INTRODUCTION.format(steps=LIGHT_STEPS) + table + "\n"
-        pages.write("generalisation", page)
+        write_page()
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 
 from benchmarks.bundles import bundles, draw
-from benchmarks.pages import print_head, print_row
+from benchmarks.pages import table
 from benchmarks.processes import processor, resident, server
 from shapespace.bundle.reader import read_bundle
 from shapespace.model.shape_model import ShapeModel
@@ -20,28 +20,29 @@ def http(models: Path, count: int, duration: float) -> None:
     names = {path.parent.name: ShapeModel(read_bundle(path)) for path in bundles(models)}
     with server(models, cache=0) as (client, pid, ready):
         used, memory = processor(pid), resident(pid)
-        print(
-            f"\nReady {ready:.1f} s ({used:.1f} processor s) after the start of the process; {memory:.0f} MB resident."
-        )
-        print(
-            "\nOver HTTP, no cache: GLB of the fine mesh, ms by the clock, and processor ms of the server a request.\n"
-        )
-        print_head("model | clients | requests | errors | p50 | p95 | p99 | p99 / p50 | processor | MB after")
+        rows, requests, failed = [], 0, 0
         for name, model in names.items():
             for clients, limit in ((1, count), (16, 10**9)):
                 began = processor(pid)
                 times, errors = load(client, name, model, clients, limit, duration if clients > 1 else 1e9)
                 spent = (processor(pid) - began) / len(times)
                 quantiles = [float(np.quantile(times, q)) for q in (0.5, 0.95, 0.99)]
-                ratio = f"{quantiles[2] / quantiles[0]:.1f}"
-                print_row(name, clients, len(times), errors, *quantiles, ratio, spent, f"{resident(pid):.0f}")
-        print("\nInterpolations of 60 frames, fine mesh, streamed as JSON lines and whole as GLB.\n")
-        print_head(
-            "model | first line, ms | one frame alone, ms | frames / s | frames / processor s | "
-            "GLB, frames / processor s"
+                requests, failed = requests + len(times), failed + errors
+                rows.append([f"{name}, {clients}", *(f"{1e3 * value:.1f}" for value in (*quantiles, spent))])
+        print("\n## Over HTTP\n")
+        print("Sixteen clients at once wait longer, but each request costs the server about as much CPU time.\n")
+        print(table(("model, clients", "p50", "p95", "p99", "CPU time"), rows))
+        print(
+            "\nThe first columns are milliseconds by the clock for a GLB of the fine mesh, without a cache. There were"
         )
-        for name, model in names.items():
-            print_row(name, *interpolation(client, pid, name, model))
+        print(f"{requests} requests and {failed} errors. The server was ready {ready:.1f} s after its start, or")
+        print(
+            f"{used:.1f} s of CPU time. It had {memory:.0f} MB of memory then, and {resident(pid):.0f} MB in the end.\n"
+        )
+        print("The first frame of an animation takes about as long as a single frame.\n")
+        animations = [[name, *interpolation(client, pid, name, model)] for name, model in names.items()]
+        print(table(("60 frames", "first line", "one frame", "frames / s", "frames / CPU s, lines, GLB"), animations))
+        print("\nAnimations are streamed as JSON lines, or come whole as one GLB. Times are milliseconds by the clock.")
 
 
 def load(
@@ -74,7 +75,7 @@ def load(
     return times, errors
 
 
-def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) -> list[object]:
+def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) -> list[str]:
     """Return the time to the first line, the time of a frame by itself, and rates."""
     path = f"/v1/models/{name}/interpolations"
     keyframes = draw(model, 4).tolist()
@@ -88,7 +89,7 @@ def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) 
     for _ in range(9):
         began = time.perf_counter()
         with client.stream("GET", links["jsonl"]) as answer:
-            next(chunk for chunk in answer.iter_raw() if chunk.endswith(b"\n"))
+            next(answer.iter_lines())
             first.append(time.perf_counter() - began)
         time.sleep(0.5)  # for the frames that were begun and that nobody waits for any more
     began, spent = time.perf_counter(), processor(pid)
@@ -98,4 +99,5 @@ def interpolation(client: httpx.Client, pid: int, name: str, model: ShapeModel) 
     spent = processor(pid)
     client.get(links["glb"]).raise_for_status()
     whole = count / (processor(pid) - spent)
-    return [statistics.median(first), statistics.median(alone), f"{rate:.0f}", f"{per_second:.0f}", f"{whole:.0f}"]
+    times = (f"{1e3 * statistics.median(each):.1f}" for each in (first, alone))
+    return [*times, f"{rate:.0f}", f"{per_second:.0f}, {whole:.0f}"]

@@ -37,14 +37,3 @@ def row(cells: Iterable[str]) -> str:
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table, without a newline at its end."""
     return "\n".join(map(row, (head, ["---"] * len(head), *rows)))
-
-
-def print_head(columns: str) -> None:
-    """Print the head of a table, from the titles of its columns with bars between them."""
-    print(f"| {columns} |")
-    print("|" + "---|" * len(columns.split(" | ")))
-
-
-def print_row(*cells: object) -> None:
-    """Print a row of a table; numbers with a fraction are seconds and are printed in ms."""
-    print(row(f"{1e3 * cell:.1f}" if isinstance(cell, float) else str(cell) for cell in cells), flush=True)

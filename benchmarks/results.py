@@ -241,11 +241,6 @@ def joint_exponentials(row: dict[str, Any]) -> list[int]:
     return [every, *(count // (1 + len(row["sizes"])) for count in shares)]
 
 
-def sampling(row: dict[str, Any]) -> float:
-    """Return the cost of all samples of a run, in exponentials, including derivatives."""
-    return float(row["drawn"]["joint"] + row["drawn"]["of factors"] + worth(row))
-
-
 def worth(row: dict[str, Any]) -> float:
     """Return the cost of the derivatives of a run, in exponentials."""
     times = row["evaluation"]["times"]
@@ -303,7 +298,6 @@ def write_page() -> None:
         spread=spread,
         leading=leading,
         joint=joint_exponentials,
-        sampling=sampling,
     )
     pages.write("results", page)
 

@@ -1,10 +1,10 @@
 """Cost of a request, by stage and in total: ``python -m benchmarks.serving [stages starts growth http]``.
 
-Prints Markdown tables; ``--page`` writes them all to docs/measurements/serving.md. ``stages``, ``starts`` and
-``growth`` run in this process on one thread and count its processor seconds, so that other programs matter little.
-They alternate with three references. One SuperLU factorisation of the model's own Gauss–Newton matrix makes machines
-comparable. Linear blend shapes (a sum of m fields and the same file) are a lower bound. The exact exponential, for
-collections with a tangent space, is an upper bound. ``http`` measures a server process by the clock.
+Prints Markdown tables; ``--page`` writes them to docs/measurements/serving.md, without ``starts``. ``stages``,
+``starts`` and ``growth`` run in this process on one thread and count its processor seconds, so that other programs
+matter little. They alternate with three references. One SuperLU factorisation of the model's own Gauss–Newton matrix
+makes machines comparable. Linear blend shapes (a sum of m fields and the same file) are a lower bound. The exact
+exponential, for collections with a tangent space, is an upper bound. ``http`` measures a server process by the clock.
 """
 
 import argparse
@@ -28,11 +28,11 @@ from threadpoolctl import threadpool_limits
 from benchmarks import pages, synthetic
 from benchmarks.bundles import bundles, draw, superlu
 from benchmarks.http_requests import http
-from benchmarks.pages import print_head, print_row
+from benchmarks.pages import table
 from benchmarks.processes import resident
 from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import read_bundle
-from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.coordinates.reconstruction import Reconstruction, Reconstructor
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
@@ -49,11 +49,13 @@ GLB = MESH_FORMATS["glb"].encode
 BANDED = 5000
 PAGE = """# Serving
 
-`python -m benchmarks.serving --page` measures and writes this page. In process: on one thread, in processor seconds of
-that thread. *SuperLU* is one factorisation (symmetric mode) of the model's own normal matrix, run in turn. *Blend
-shapes* is a sum of m fields and the same file, the floor; the *exponential* is what networks stand for, the ceiling.
-[performance.md](performance.md) has the aims, and why it is as fast as it is. Measured on
-{day:%Y-%m-%d}; models may have been trained anew since.
+How long does the server take for a shape, where does the time go, and how does it grow? A shape of the figure takes
+about ten milliseconds of one core. [benchmarks/NOTES.md](../../benchmarks/NOTES.md#performance) says why it is as fast
+as it is.
+
+Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu-time) of one thread in milliseconds,
+medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day}; the
+models may have been trained again since.
 """
 #: Two results of one code agree up to this fraction of the diagonal.
 AGREEMENT = 1e-4
@@ -128,41 +130,45 @@ def away(model: ShapeModel, codes: Codes) -> list[float]:
 
 def stages(folders: list[Path], count: int) -> None:
     """Print times by stage, for every bundle in some folders."""
-    print("\nCode → GLB of the fine mesh in process, ms, medians; in brackets steps of Gauss–Newton. *Without")
-    print("MKL*: multiple of the sum. *Away*: the furthest vertex from a solution of tolerance 1e-10, in")
-    print("millionths of the diagonal, median and most over the codes.\n")
-    print_head(
-        "model | network | reconstruct | encode | sum | p95 | p99 | draft | SuperLU | sum / SuperLU | "
-        "draft / SuperLU | without MKL | away | blend shapes | exponential, K = 16"
-    )
+    own: list[list[str]] = []
+    tails: list[list[str]] = []
+    beside: list[list[str]] = []
     for path in (path for folder in folders for path in bundles(folder)):
         model = ShapeModel(read_bundle(path))
         codes = draw(model, count + 3)
         times = measure(path, model, codes)
         median = {name: statistics.median(values[3:]) for name, values in times.items()}
         distances = away(model, codes)
-        print_row(
-            f"{model.manifest.name}, V = {model.manifest.vertices}",
-            median["network"],
-            f"{1e3 * median['reconstruct']:.1f} ({statistics.mean(times['iterations'][3:]):.1f})",
-            median["encode"],
-            median["sum"],
-            *(float(np.quantile(times["sum"][3:], q)) for q in (0.95, 0.99)),
-            median["draft"],
-            median["SuperLU"],
-            *(f"{median[name] / median['SuperLU']:.2f}" for name in ("sum", "draft")),
-            f"{median['without MKL'] / median['sum']:.2f}",
-            f"{statistics.median(distances):.1f}, {max(distances):.1f}",
-            median["blend shapes"],
-            ceiling(model, codes[:5]),
-        )
+        name = f"{model.manifest.name}, V = {model.manifest.vertices}"
+        steps = statistics.mean(times["iterations"][3:])
+        p95, p99 = (ms(float(np.quantile(times["sum"][3:], q))) for q in (0.95, 0.99))
+        limit = ceiling(model, codes[:5])
+        solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
+        own.append([name, ms(median["network"]), solved, ms(median["encode"]), ms(median["sum"])])
+        tails.append([name, p95, p99, ms(median["draft"]), f"{median['without MKL'] / median['sum']:.2f}"])
+        shares = " / ".join(f"{median[key] / median['SuperLU']:.2f}" for key in ("sum", "draft"))
+        furthest = f"{statistics.median(distances):.1f}, {max(distances):.1f}"
+        beside.append([name, ms(median["blend shapes"]), ms(limit) if limit else "–", shares, furthest])
+    print("\n## A shape as a file\n")
+    print("Reconstruction takes most of the time, and writing the file little.\n")
+    print(table(("code → GLB of the fine mesh", "networks", "reconstruction (steps)", "file", "sum"), own))
+    print("\nSteps are of [Gauss–Newton](../reference/glossary.md#gaussnewton). V is the number of coarse vertices.")
+    print("\nSlow codes are rare except for the horse and the torus. A draft takes about half of the time.\n")
+    print(table(("", "p95 of the sum", "p99", "draft", "without MKL"), tails))
+    print("\nThe last column is a multiple of the sum, for a server without [MKL](../reference/glossary.md#blas-mkl).")
+    print("\nA shape takes about a tenth of the time of an exact one, and about ten times the time of blend shapes.\n")
+    print(table(("", "blend shapes", "exact exponential", "sum / draft, in SuperLU", "away"), beside))
+    print("\n*Blend shapes* is a lower bound: it adds m displacement fields and writes the same file.")
+    print("[*SuperLU*](../reference/glossary.md#superlu) is the time of one factorisation of the model's own matrix.")
+    print("*Away*: largest distance from a solution with tolerance 1e-10, in millionths of the diagonal, as median and")
+    print("largest over the codes.")
 
 
-def ceiling(model: ShapeModel, codes: Codes) -> float | str:
+def ceiling(model: ShapeModel, codes: Codes) -> float | None:
     """Return the time of the exact exponential, if the model has modes."""
     facts = model.manifest
     if model.decoder.modes is None or facts.exponential_steps is None:
-        return "–"
+        return None
     space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
     velocities = [np.tensordot(code.astype(np.float64), model.decoder.modes, 1) for code in codes]
     start, steps = model.reference.vertices, facts.exponential_steps
@@ -171,16 +177,23 @@ def ceiling(model: ShapeModel, codes: Codes) -> float | str:
 
 def starts(models: Path, count: int) -> None:
     """Print Gauss–Newton steps by start, and whether all starts of a code end in one shape."""
-    print(f"\nSteps (processor ms) by start, and codes at which two results are more than {AGREEMENT:g} of the")
-    print("diagonal apart; `ours` is what the product does. The neighbour is a shape a tenth of the box away.\n")
-    print_head("model, box | ours | frames | learned | neighbour | reference | codes | apart | status")
+    found: list[list[str]] = []
     for path in bundles(models):
         model = ShapeModel(read_bundle(path))
         for spread in (1.0, 1.5):
-            print_row(f"{model.manifest.name} × {spread:g}", *_starts(model, draw(model, count, spread)))
+            name = f"{model.manifest.name} × {spread:g}"
+            found.append([name, *_starts(model, draw(model, count, spread))])
+    print("\n## Starts of the reconstruction\n")
+    print("Inside the bounds all starts end in the same shape, and ours needs the least time.\n")
+    print(table(("model, bounds", "ours", "frames, neighbour", "learned, reference", "ends apart"), found))
+    print("\nSteps, and in brackets milliseconds. *Frames* integrates lengths and angles along a tree of faces, and")
+    print(
+        "*learned* asks a network. *Neighbour* is a shape a tenth of the bounds away. *Ends apart*: codes at which two"
+    )
+    print(f"results differ by more than {AGREEMENT:g} of the diagonal.")
 
 
-def _starts(model: ShapeModel, codes: Codes) -> list[object]:
+def _starts(model: ShapeModel, codes: Codes) -> list[str]:
     reconstruct = Reconstructor(model.reference, model.manifest.eta_reconstruction)
     radius = 0.1 * (model.latents.upper - model.latents.lower) / 2
     rng = np.random.default_rng(1)
@@ -219,24 +232,21 @@ def _starts(model: ShapeModel, codes: Codes) -> list[object]:
         steps, times = zip(*spent[name], strict=True)
         return f"{statistics.mean(steps):.1f} ({1e3 * statistics.median(times):.0f})"
 
-    names = "ours", "frames", "learned", "neighbour", "reference"
     said = ", ".join(f"{count} {status}" for status, count in statuses.items() if count)
-    return [*map(cell, names), len(codes), apart, said]
+    pairs = [", ".join(map(cell, pair)) for pair in (("frames", "neighbour"), ("learned", "reference"))]
+    return [cell("ours"), *pairs, f"{apart} of {len(codes)}; {said}"]
 
 
 def growth(count: int) -> None:
     """Print the growth of times with the number of vertices and with the dimension."""
+    print("\n## Growth")
+    largest = 0.0
     with tempfile.TemporaryDirectory() as folder:
         for kind, cases in (
             ("V", [(v, 20) for v in (500, 1000, 2000, 5000, 10_000, 20_000, 50_000)]),
             ("m", [(1000, m) for m in (4, 20, 40, 80)]),
         ):
-            print(f"\nSynthetic capsules, growing {kind}; medians, ms. *Factor*: one of Gauss–Newton.\n")
-            print_head(
-                "V | m | network | reconstruct (steps) | factor | encode | sum | SuperLU | sum / SuperLU | "
-                "blend shapes | MB"
-            )
-            sizes, sums, factors = [], [], []
+            found, sizes, sums = [], [], []
             for vertices, latents in cases:
                 path = synthetic.write(Path(folder) / kind, vertices, latents)
                 model = ShapeModel(read_bundle(path))
@@ -245,31 +255,22 @@ def growth(count: int) -> None:
                 steps = statistics.mean(times["iterations"][2:])
                 sizes.append(vertices if kind == "V" else latents)
                 sums.append(median["sum"])
-                factors.append(factor(model))
-                print_row(
-                    model.manifest.vertices,
-                    latents,
-                    median["network"],
-                    f"{1e3 * median['reconstruct']:.1f} ({steps:.1f})",
-                    factors[-1],
-                    median["encode"],
-                    median["sum"],
-                    median["SuperLU"],
-                    f"{median['sum'] / median['SuperLU']:.2f}",
-                    median["blend shapes"],
-                    f"{resident(os.getpid()):.0f}",
-                )
-            grown = {"The sum": sums, "one factor": factors, "the sum without one factor": np.subtract(sums, factors)}
-            laws = [f"{name} as {kind}^{np.polyfit(np.log(sizes), np.log(y), 1)[0]:.2f}" for name, y in grown.items()]
-            print(f"\n{', '.join(laws)} (least squares in logarithms). Memory is this process's, all sizes so far.")
+                largest = max(largest, resident(os.getpid()))
+                size = str(model.manifest.vertices if kind == "V" else latents)
+                solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
+                ratio = f"{median['sum'] / median['SuperLU']:.2f}"
+                found.append([size, ms(median["network"]), solved, ms(median["sum"]), ratio])
+            if kind == "V":
+                print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.\n")
+                print(table((kind, "networks", "reconstruction (steps)", "sum", "sum / SuperLU"), found))
+            power = np.polyfit(np.log(sizes), np.log(sums), 1)[0]
+            print(f"\nFrom {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
+    print(f"The shapes are synthetic capsules. This process had up to {largest:.0f} MB.")
 
 
-def factor(model: ShapeModel) -> float:
-    """Return the time of one Gauss–Newton factorisation, at the reference."""
-    target = nric(model.reference.vertices, model.reference.connectivity)
-    with model.decoder.solver() as reconstruct:
-        point = reconstruct._squares(model.reference.vertices, target)
-        return statistics.median(seconds(lambda: reconstruct.solver.factor(point, target)) for _ in range(5))
+def ms(seconds: float) -> str:
+    """Return a cell in milliseconds."""
+    return f"{1e3 * seconds:.1f}"
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -282,8 +283,8 @@ def seconds(work: Callable[[], object]) -> float:
 def main() -> None:
     """Measure and print, or write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("stages", "starts", "growth", "http")
-    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=[], help="default: all")
+    parts = ("stages", "growth", "http")
+    parser.add_argument("parts", nargs="*", choices=[*parts, "starts", []], default=[], help="default: all but starts")
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
     parser.add_argument("--more", type=Path, nargs="*", default=[], help="further ones, for stages only")
     parser.add_argument("--count", type=int, default=30, help="codes for each median")
@@ -296,7 +297,7 @@ def main() -> None:
         return
     with redirect_stdout(io.StringIO()) as text:
         run(arguments)
-    page = PAGE.format(day=datetime.now(UTC))
+    page = PAGE.format(day=f"{datetime.now(UTC):%Y-%m-%d}", count=arguments.count)
     pages.write("serving", page + text.getvalue())
 
 

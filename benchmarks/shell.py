@@ -49,21 +49,18 @@ def even_capsule(count: int, radius: float = 1.0, length: float = 2.0) -> Triang
     return TriangleMesh.from_arrays(np.stack([x, rho * np.cos(phi), rho * np.sin(phi)], axis=1), faces)
 
 
-def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Return medians of the task's seconds, of its processor seconds, and of their ratio to the yardstick's."""
+def timed(task: Callable[[], object], yardstick: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Return medians of the task's processor seconds, and of their ratio to the yardstick's."""
     task()
     measured = [(clock(yardstick), clock(task)) for _ in range(repeats)]
-    wall = [own[0] for _, own in measured]
-    cpu = [own[1] for _, own in measured]
-    ratio = [own[1] / other[1] for other, own in measured]
-    return float(np.median(wall)), float(np.median(cpu)), float(np.median(ratio))
+    return float(np.median([own for _, own in measured])), float(np.median([own / other for other, own in measured]))
 
 
-def clock(task: Callable[[], object]) -> tuple[float, float]:
-    """Return wall seconds and processor seconds; another process on the machine disturbs the latter less."""
-    wall, cpu = time.perf_counter(), time.process_time()
+def clock(task: Callable[[], object]) -> float:
+    """Return processor seconds, which another process on the machine disturbs little."""
+    began = time.process_time()
     task()
-    return time.perf_counter() - wall, time.process_time() - cpu
+    return time.process_time() - began
 
 
 def largest_residual(space: ShellSpace, path: DiscretePath) -> float:
@@ -105,13 +102,13 @@ class Case:
         if not path.converged:
             raise ArithmeticError(f"{name}, V = {len(self.mesh.vertices)}: {path.reason}")
         residual = largest_residual(self.space, path)
-        print(row(name, self, find, repeats), f"{path.iterations} | {residual:.1e} |", flush=True)
+        print(row(name, self, find, repeats), f"{path.iterations} ({residual:.1e}) |", flush=True)
 
 
 def row(name: str, case: Case, task: Callable[[], object], repeats: int) -> str:
     """Return the timed columns of a row."""
-    wall, cpu, ratio = timed(task, case.superlu, repeats)
-    return f"| {name} | {len(case.mesh.vertices)} | {wall:.3f} | {cpu:.3f} | {ratio:.2f} |"
+    cpu, ratio = timed(task, case.superlu, repeats)
+    return f"| {name} | {len(case.mesh.vertices)} | {cpu:.3f} | {ratio:.2f} |"
 
 
 def main() -> None:
@@ -123,8 +120,8 @@ def main() -> None:
     options = parser.parse_args()
     with threadpool_limits(1):
         ShellSpace(even_capsule(100)).factorisations(1)  # load the solver's library
-        print("| | V | seconds | processor | × SuperLU | iterations | residual |")
-        print("|---|---|---|---|---|---|---|")
+        print("| | V | seconds | × SuperLU | iterations (residual) |")
+        print("|---|---|---|---|---|")
         cases = [Case(count) for count in options.sizes]
         for case in cases:
             case.report("exponential, K = 16", partial(case.shoot, 16), options.repeats)
@@ -140,14 +137,14 @@ def main() -> None:
             task = partial(reconstruct, target)
             print(row("Gauss–Newton from the reference", case, task, options.repeats), end=" ")
             found = task()
-            print(f"{found.iterations} | {found.residual:.1e} |", flush=True)
+            print(f"{found.iterations} ({found.residual:.1e}) |", flush=True)
         if len(options.growth) > 1:
             print("\n| V | analysis | exponential, K = 16 | geodesic, K = 8 |\n|---|---|---|---|")
             rows = []
             for count in options.growth:
                 case, repeats = Case(count), 3
                 shoot, connect = (
-                    float(np.median([clock(task)[1] for _ in range(repeats)]))
+                    float(np.median([clock(task) for _ in range(repeats)]))
                     for task in (partial(case.shoot, 16), partial(case.connect, 8))
                 )
                 rows.append((count, shoot, connect))

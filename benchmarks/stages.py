@@ -13,6 +13,7 @@ import time
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import trimesh
@@ -30,17 +31,40 @@ from shapespace.training.stages.run import STAGES
 #: Number of joint exponentials and of exponentials of each factor, which determine the time; codes for each median.
 JOINT, OF_FACTORS, CODES = 100, 50, 30
 
+#: Stored figures of all sizes.
+FIGURES = ROOT / "runs" / "growth.json"
+#: Stages with a column of their own.
+COLUMNS = ("ingest", "modes", "samples", "networks")
+
 PAGE = """# How training grows
 
-`python -m benchmarks.stages` writes this page: the real command on capsules that bend and bulge, with {joint} joint
-exponentials and {factors} of each factor. The first row is the base; in each of the others one size is another:
-vertices of the files, shapes n, modes m, or vertices of the coarse mesh. For each stage processor seconds, those of its
-workers included and those of starting left out, of one run, with one BLAS thread; those of `samples` and `networks`
-grow with the number of exponentials, which is 1000 and more in a real run. Memory is the largest resident set of a
-process, of `ingest` and of whatever stage has most. The last two columns are of the model that comes out: processor
-milliseconds of a shape on the coarse mesh, and what carrying the fine mesh along adds, medians over {codes} codes.
-Measured on {day:%Y-%m-%d}; training may have changed since.
+How much time and memory does a training run need, and what makes it need more? One size is changed at a time.
 
+## Time
+
+Reading grows with the vertices of your files. All other stages grow with the coarse mesh, and `modes` grows with the
+number of shapes.
+
+{seconds}
+
+The base has {base.shapes} shapes of {base.fine:,} vertices, {base.coarse} coarse vertices and {base.modes} modes. In
+each other row one size is another. Figures are seconds of [CPU time](../reference/glossary.md#cpu-time) with all
+workers. `samples` and `networks` also grow with the number of exponentials. Here there are {joint} joint ones and
+{factors} of each factor; a real run has 1000 and more.
+
+## Memory, and the model
+
+Memory stays below 1 GB up to 40,000 vertices in the files; 500,000 vertices need under 3 GB.
+
+{memory}
+
+- **all stages**: CPU time of the whole run in seconds, without the time to start.
+- **memory**: resident memory of the largest process.
+- **coarse shape**: CPU time that the finished model takes for a shape on the coarse mesh.
+- **fine mesh**: further time to carry the fine mesh along. Both are medians over {codes} codes.
+
+The collections are capsules that bend and bulge. `python -m benchmarks.stages` runs the real command on them, with one
+BLAS thread, and writes this page from `runs/growth.json`. Measured on {day}.
 """
 
 
@@ -52,6 +76,12 @@ class Size:
     shapes: int = 20
     modes: int = 8
     coarse: int = 500
+
+    def beside(self, base: Self) -> str:
+        """Say in words where this size differs from another."""
+        words = {"fine": "vertices in a file", "coarse": "coarse vertices"}
+        own, others = asdict(self), asdict(base)
+        return ", ".join(f"{own[key]:,} {words.get(key, key)}" for key in own if own[key] != others[key])
 
 
 BASE = Size()
@@ -140,15 +170,36 @@ def serving(folder: Path) -> tuple[float, float]:
     return coarse, fine - coarse
 
 
+def write_page() -> None:
+    """Write the page from the stored figures."""
+    found = json.loads(FIGURES.read_text(encoding="utf-8"))
+    seconds, memory = [], []
+    for row in found["rows"]:
+        title = Size(**row["size"]).beside(BASE) or "base"
+        spent, megabytes, times = row["seconds"], row["megabytes"], row["milliseconds"]
+        seconds.append([title, *(f"{spent[stage]:.1f}" for stage in COLUMNS)])
+        memory.append([title, f"{sum(spent.values()):.0f}", f"{megabytes['most']:.0f} MB"])
+        memory[-1] += [f"{times[each]:.1f} ms" for each in ("shape", "fine mesh")]
+    page = PAGE.format(
+        base=BASE,
+        joint=JOINT,
+        factors=OF_FACTORS,
+        codes=CODES,
+        day=found["day"],
+        seconds=table(("", *(f"`{stage}`" for stage in COLUMNS)), seconds),
+        memory=table(("", "all stages", "memory", "coarse shape", "fine mesh"), memory),
+    )
+    pages.write("growth", page)
+
+
 def main() -> None:
     """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "stages")
+    parser.add_argument("--page", action="store_true", help="measure nothing, and write the page of what is there")
     given = parser.parse_args()
-    shown = [stage for stage in STAGES if stage != "factors"]
-    head = ["files' V", "n", "m", "coarse V", *shown, "ingest MB", "most MB", "shape ms", "fine mesh ms"]
-    rows: list[list[str]] = []
-    for size in SIZES:
+    rows: list[dict[str, Any]] = []
+    for size in [] if given.page else SIZES:
         name = "-".join(map(str, asdict(size).values()))
         path = given.out / f"{name}.json"
         if not path.exists():
@@ -157,14 +208,20 @@ def main() -> None:
                 path.write_text(
                     json.dumps({"stages": measured, "serving": serving(given.out / name)}), encoding="utf-8"
                 )
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        found = kept["stages"]
-        seconds = [f"{found[stage][0]:.1f}" for stage in shown]
-        memory = [found["ingest"][1], max(most for _, most in found.values())]
-        rows.append([*map(str, asdict(size).values()), *seconds, *(f"{mb:.0f}" for mb in memory)])
-        rows[-1] += [f"{ms:.1f}" for ms in kept["serving"]]
-    text = PAGE.format(joint=JOINT, factors=OF_FACTORS, codes=CODES, day=datetime.now(UTC)) + table(head, rows) + "\n"
-    pages.write("growth", text)
+        found = json.loads(path.read_text(encoding="utf-8"))
+        stages = {stage: used for stage, used in found["stages"].items() if stage != "factors"}
+        most = max(megabytes for _, megabytes in found["stages"].values())
+        rows.append(
+            {
+                "size": asdict(size),
+                "seconds": {stage: seconds for stage, (seconds, _) in stages.items()},
+                "megabytes": {"ingest": stages["ingest"][1], "most": most},
+                "milliseconds": dict(zip(("shape", "fine mesh"), found["serving"], strict=True)),
+            }
+        )
+    if rows:
+        FIGURES.write_text(json.dumps({"day": f"{datetime.now(UTC):%Y-%m-%d}", "rows": rows}, indent=1), "utf-8")
+    write_page()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import yaml
 from tests.long.__main__ import BEGIN, END, RECORD, TESTS, recorded
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")), ROOT / "benchmarks" / "NOTES.md"]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
@@ -45,6 +45,12 @@ def test_tests_that_are_named_are_there(page: Path) -> None:
     for name, case in re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", page.read_text(encoding="utf-8")):
         assert (ROOT / name).exists(), name
         assert not case or f"def {case}" in (ROOT / name).read_text(encoding="utf-8"), case
+
+
+@pytest.mark.parametrize("page", [name for name in NAMES if "/measurements/" in name or "is-it" in name])
+def test_tables_for_readers_have_at_most_five_columns(page: str) -> None:
+    rows = re.findall(r"^\|[-| :]+\|$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert all(row.count("|") <= 6 for row in rows)
 
 
 def test_the_citation_is_of_this_version() -> None:
@@ -84,4 +90,5 @@ def test_the_site_has_every_page() -> None:
         return [entry] if isinstance(entry, str) else [page for part in inside for page in listed(part)]
 
     site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-    assert sorted(f"docs/{page}" for page in listed(site["nav"])) == [name for name in NAMES if "/" in name]
+    pages = [name.removeprefix("docs/") for name in NAMES if name.startswith("docs/")]
+    assert sorted(listed(site["nav"])) == pages

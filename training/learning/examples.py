@@ -28,7 +28,7 @@ class ExampleGaussians:
     examples: int = 512  # largest number of examples; the examples with the largest errors are kept
     coordinates: int = 64  # largest number of coordinates that distinguish shapes
     # Standard deviation of a Gaussian, as a share of the distance to the nearest other example, where it has fallen to
-    # 0.4 %. Larger Gaussians change random codes more (docs/measurements/notes.md, Examples).
+    # 0.4 %. Larger Gaussians change random codes more (benchmarks/NOTES.md, Examples).
     width: float = 0.3
     same: float = 1e-3  # examples nearer to each other than this share of the largest distance count as one
     distinct: float = 0.3  # smallest singular value of the Gaussians' matrix that is used; a single example has 1

@@ -22,7 +22,7 @@ The right sparsity depends on the shapes. The modes cannot reproduce on held-out
 certain sparsity costs nothing. By default λ is the largest value that raises the square error of held-out shapes by at
 most 3 %. Principal modes in inner folds estimate this error.
 
-What a sparsity costs in each norm is in docs/measurements/notes.md.
+What a sparsity costs in each norm is in benchmarks/NOTES.md.
 """
 
 from collections.abc import Callable

@@ -44,12 +44,12 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(pages, "MEASUREMENTS", tmp_path)
     results.write_page()
     page = (tmp_path / "results.md").read_text()
-    assert "| horse | 35 | 20 | 5 |" in page
+    assert "| horse | 35 | 20 | 5 (1 – 7) |" in page
     kernel = row["evaluation"]["fresh"]["r2"]["kernel"]["total"]
-    assert f"| 0.8765 | 0.9981 | **{kernel:.4f}** |" in page, "the best is bold"
+    assert f"| horse | 0.8765 | 0.9981 | **{kernel:.4f}** |" in page, "the best is bold"
     assert "yet: hand, faces, samba, makehuman, hippocampus." in page
     assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
-    assert "| bodies" not in page, "aims of what was not measured"
+    assert "## Number of samples" not in page, "nothing of what was not measured"
 
 
 def test_a_row_of_folds_counts_each_shape_once() -> None:
@@ -61,9 +61,11 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
             "shapes": shapes,
         }
 
-    cells = served.compared([fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)])
-    assert cells[:6] == ["3.250", "10.000", "2.000", "10.000", "1.62", "0.50 – 2.00"]
-    assert cells[6:] == ["3.250", "1.62", "0.50 – 2.00"]
+    folds = [fold(0.01, 0.02, 1), fold(0.04, 0.02, 3)]
+    for model in (None, served.WITHOUT_EXAMPLES):
+        assert served.average(folds, model) == "3.250\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}10.000"
+        assert served.ratio(folds, model) == "1.62 (0.50–2.00)"
+    assert served.average(folds, "components") == "2.000\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}10.000"
 
 
 def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,7 @@ class AutoChoice:
 
 
 AUTO = AutoChoice()
-#: Convolutions for features that move over the surface (docs/measurements/notes.md, Freaky Torus for three epochs).
+#: Convolutions for features that move over the surface (benchmarks/NOTES.md, Freaky Torus for three epochs).
 MOVING_FEATURES = ConvolutionSettings(
     layers=5,
     width=40,
