@@ -33,7 +33,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.negotiation import choose
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
-from shapespace.service.use_cases.uploads import FORMATS, UploadError, read_mesh_files
+from shapespace.service.use_cases.uploads import UploadError, read_mesh_files
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from tests.hostile import BINARY, MATRIX, document, glb
@@ -204,7 +204,7 @@ def forget() -> Iterator[None]:
     model.cache_clear()
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", SOUND)
 def test_uploads(format: str) -> None:
     @fuzz
     @given(damaged(SOUND[format]))
