@@ -144,7 +144,7 @@ def strip(pictures: list[NDArray[np.uint8]]) -> tuple[plt.Figure, list[Axes]]:
 
 def finish(figure: plt.Figure, path: Path) -> None:
     """Save a figure with few colours, which makes small files."""
-    figure.savefig(path, dpi=DPI, facecolor="white")
+    figure.savefig(path, dpi=DPI, facecolor="white", bbox_inches="tight")
     plt.close(figure)
     Image.open(path).convert("RGB").quantize(128).save(path, optimize=True)
 
