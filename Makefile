@@ -55,12 +55,14 @@ test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k 
 check: $(VENV)/.check ## what is quick: style, types, imports; the tests of the library, the use cases and the pages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	@$(BIN)/mypy shapespace --exclude '^shapespace/training/' & types=$$!; \
 		$(BIN)/lint-imports && PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) $(QUICK) $(ARGS) && wait $$types
 
-lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, imports between packages and the Dockerfile
+lint: $(VENV)/.all $(BIN)/hadolint ## check style, spelling, types, imports between packages and the Dockerfile
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
