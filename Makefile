@@ -130,7 +130,8 @@ configuration: $(VENV)/.train ## write docs/reference/configuration.md from the 
 	$(BIN)/python -m scripts.configuration
 
 docs: $(VENV)/.docs ## make a site of docs/ in build/site; a link that leads nowhere ends it
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m scripts.site
+	$(BIN)/python -m scripts.site
+	$(BIN)/zensical build --strict --clean --config-file build/mkdocs.yml
 
 clean: ## remove what these targets made, except runs/
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
