@@ -139,7 +139,7 @@ clean: ## remove what these targets made, except runs/
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
 $(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $(VENV)/.check: $(VENV)/.%: pyproject.toml | $(VENV)/.created
-	@echo "Installing what make needs for this into $(VENV), once. It takes some minutes."
+	@echo "Installing packages into $(VENV). The first time takes some minutes."
 	@$(BIN)/python -m pip --quiet --disable-pip-version-check install --editable '.[$(or $(EXTRAS_OF_$*),$*)]'
 	@touch $@
 

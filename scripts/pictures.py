@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from scipy.interpolate import CubicSpline
@@ -86,7 +87,7 @@ def exponential(model: shapespace.ShapeModel, path: Path) -> None:
     finish(row, path)
 
 
-def arrow(figure: plt.Figure, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
+def arrow(figure: Figure, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
     """Draw an arrow between two points of the figure, with words in its middle."""
     style = {"arrowstyle": "->", "color": BLUE, "lw": 1.5}
     figure.axes[0].annotate("", end, start, "figure fraction", "figure fraction", arrowprops=style)
@@ -130,7 +131,7 @@ def remember(path: Path) -> None:
     finish(figure, path)
 
 
-def strip(pictures: list[NDArray[np.uint8]]) -> tuple[plt.Figure, list[Axes]]:
+def strip(pictures: list[NDArray[np.uint8]]) -> tuple[Figure, list[Axes]]:
     """Return a figure with pictures side by side, and their axes."""
     height, width = pictures[0].shape[:2]
     size = (len(pictures) * width / DPI, height / DPI + 0.9)
@@ -142,7 +143,7 @@ def strip(pictures: list[NDArray[np.uint8]]) -> tuple[plt.Figure, list[Axes]]:
     return figure, list(grid[0])
 
 
-def finish(figure: plt.Figure, path: Path) -> None:
+def finish(figure: Figure, path: Path) -> None:
     """Save a figure with few colours, which makes small files."""
     figure.savefig(path, dpi=DPI, facecolor="white", bbox_inches="tight")
     plt.close(figure)
