@@ -55,12 +55,14 @@ test: $(VENV)/.all $(MODULES) $(VENV)/.browser ## run the whole suite (ARGS="-k 
 check: $(VENV)/.check ## what is quick: style, types, imports; the tests of the library, the use cases and the pages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	@$(BIN)/mypy shapespace --exclude '^shapespace/training/' & types=$$!; \
 		$(BIN)/lint-imports && PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m pytest --numprocesses $(JOBS) $(QUICK) $(ARGS) && wait $$types
 
-lint: $(VENV)/.all $(BIN)/hadolint ## check style, types, imports between packages and the Dockerfile
+lint: $(VENV)/.all $(BIN)/hadolint ## check style, spelling, types, imports between packages and the Dockerfile
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
@@ -128,7 +130,8 @@ configuration: $(VENV)/.train ## write docs/reference/configuration.md from the 
 	$(BIN)/python -m scripts.configuration
 
 docs: $(VENV)/.docs ## make a site of docs/ in build/site; a link that leads nowhere ends it
-	$(BIN)/mkdocs build --strict
+	$(BIN)/python -m scripts.site
+	$(BIN)/zensical build --strict --clean --config-file build/mkdocs.yml
 
 clean: ## remove what these targets made, except runs/
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-blender tests/node_modules tests/firefox/node_modules build dist *.egg-info .*_cache
@@ -136,7 +139,8 @@ clean: ## remove what these targets made, except runs/
 
 # A stamp says which extras the environment holds, so that a second call starts at once.
 $(VENV)/.client $(VENV)/.serve $(VENV)/.train $(VENV)/.docs $(VENV)/.check: $(VENV)/.%: pyproject.toml | $(VENV)/.created
-	$(BIN)/python -m pip install --editable '.[$(or $(EXTRAS_OF_$*),$*)]'
+	@echo "Installing packages into $(VENV). The first time takes some minutes."
+	@$(BIN)/python -m pip --quiet --disable-pip-version-check install --editable '.[$(or $(EXTRAS_OF_$*),$*)]'
 	@touch $@
 
 $(VENV)/.all: pyproject.toml $(if $(LOCKED),requirements/dev.txt) | $(VENV)/.created

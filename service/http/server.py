@@ -22,6 +22,7 @@ from fastapi import FastAPI
 from shapespace.service.http.connections import HEAD_BYTES, Connection
 from shapespace.service.logs import RateLimitedLog
 from shapespace.service.operation.metrics_port import MetricsPort
+from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
 
 logger = logging.getLogger(__name__)
@@ -95,7 +96,10 @@ class Server(uvicorn.Server):
         # Port 0 lets the system choose one.
         host, port = self._listeners[0].getsockname()[:2]
         host = f"[{host}]" if ":" in host else host
-        print(f"shapespace is at http://{host}:{port}/", flush=True)
+        address = f"http://{host}:{port}"
+        print(f"shapespace is at {address}/", flush=True)
+        if call := _first_call(address, self._app.state.service.repository, self._settings.api_key is not None):
+            print(f"Your first shape, from another terminal: {call}", flush=True)
 
     def _hang_up(self) -> None:
         if self._terminal and not sys.stdin.isatty():  # the terminal was closed, which is no request to reload
@@ -192,3 +196,14 @@ def _bound(host: str, port: int) -> list[socket.socket]:
     if missing and not listeners:
         raise missing
     return listeners
+
+
+def _first_call(address: str, models: ModelRepository, has_key: bool) -> str | None:
+    """Return a curl command that saves a shape of the model with the fewest coordinates; None if there is no model."""
+    if not len(models):
+        return None
+    model = min(models, key=lambda model: model.dimension)
+    name = model.manifest.name
+    code = ",".join(f"{(3 * low + 5 * high) / 8:.2g}" for low, high in zip(model.lower, model.upper, strict=True))
+    key = ' -H "X-API-Key: $SHAPESPACE_API_KEY"' if has_key else ""
+    return f"curl -o {name}.glb{key} '{address}/v1/models/{name}/mesh?latent={code}'"

@@ -13,7 +13,7 @@ def test_the_shape_moves_by_itself_until_anything_is_touched(window: Open) -> No
     studio = window(reduced_motion="no-preference")
     studio.page.goto(f"{studio.url}/#model=with-fine")
     studio.eventually(studio["#welcome"].is_visible)
-    assert "A handful of numbers, a shape" in studio["#welcome"].inner_text()
+    assert "A few numbers become a 3D shape" in studio["#welcome"].inner_text()
     assert "Parametrizing Product Shape Manifolds by Composite Networks" in studio["#welcome"].inner_text()
     studio.eventually(lambda: studio[".coordinate"].count() == 3)
     bounds = [(-0.2, 0.2), (-3.15, 3.15), (0, 1)]

@@ -34,7 +34,7 @@ UNTRIED = {
     ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
         "needs a container engine; `make long image-test` builds and tries the same"
     ),
-    ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the same request is in the README",
+    ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the block above it sends the same request",
 }
 
 

@@ -320,3 +320,11 @@ def test_the_dashboard_and_the_alerts_ask_for_metrics_that_there_are(plain: Serv
             assert wanted <= known, text
     for rule in (rule for group in rules for rule in group["rules"]):
         assert {"summary", "description"} == rule["annotations"].keys()
+
+
+def test_the_call_printed_at_the_start_gives_a_shape(guarded: Server, tmp_path: Path) -> None:
+    assert guarded.process.stdout
+    call = guarded.process.stdout.readline().partition(": ")[2]
+    environment = os.environ | {"SHAPESPACE_API_KEY": KEY["X-API-Key"]}
+    subprocess.run(["bash", "-ec", call], cwd=tmp_path, env=environment, check=True, timeout=60)
+    assert (tmp_path / "small.glb").read_bytes()[:4] == b"glTF"
