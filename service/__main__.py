@@ -20,8 +20,8 @@ SWITCH_SECONDS = 0.0005
 SHORT_KEY = 16
 #: Packages of the extra ``serve`` by the names of their modules, without those that are only faster.
 NEEDED = (
-    "cachetools", "fastapi", "httptools", "onnx", "onnxruntime", "orjson", "prometheus_client", "pydantic",
-    "pydantic_settings", "python_multipart", "pythonjsonlogger", "starlette", "threadpoolctl", "trimesh", "uvicorn",
+    "cachetools", "fastapi", "h11", "onnx", "onnxruntime", "orjson", "prometheus_client", "pydantic",
+    "pydantic_settings", "python_multipart", "pythonjsonlogger", "starlette", "trimesh", "uvicorn",
 )  # fmt: skip
 
 

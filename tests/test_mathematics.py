@@ -19,6 +19,7 @@ def test_every_function_of_the_page_exists() -> None:
 ROOMS = {"shapespace": ("solve", "coordinates", "mesh", "shell", "model"), "training": ("space", "learning")}
 #: Modules in them that implement no formula: they store, name, choose, run or write.
 NO_MATHEMATICS = {
+    "shapespace.solve.blas_threads",
     "shapespace.solve.deadline",
     "shapespace.mesh.attributes",
     "shapespace.mesh.vectors",
