@@ -250,6 +250,19 @@ class Decoder:
         """Return the predicted NRIC (2E,) of a code (m,), normalised; not finite where the networks overflow."""
         return self._networks(code[None].astype(np.float32))[1][0]
 
+    def nric_nearby(self, code: FloatArray, steps: FloatArray) -> Iterator[FloatArray]:
+        """Yield the predicted NRIC (2E,) of a code (m,), then of m codes that each differ by one coordinate's step."""
+        factors, z = self._networks(code[None].astype(np.float32))
+        yield z[0]
+        for j, factor in enumerate(self.manifest.factors):
+            for k in range(factor.start, factor.stop):
+                with self._limited() as until:
+                    part, others = code[None, factor.start : factor.stop].copy(), factors.copy()
+                    part[0, k - factor.start] += steps[k]
+                    others[:, j] = self._factors[j](part.astype(np.float32), until)
+                    z = self._combiner(others, until).astype(np.float64)
+                yield z[0]
+
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
         """Return the NRIC (n, 2E) of factor j for its parts (n, m_j) of codes, normalised."""
         with self._limited() as until:

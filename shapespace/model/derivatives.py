@@ -27,9 +27,9 @@ def derivatives(model: Decoder, x: FloatArray) -> FloatArray:
 
     One code at a time is faster than a batch: the combiner's arrays for many codes do not fit into the cache.
     """
-    z = model.nric(x)
-    steps = np.diag(_steps(model))
-    return np.stack([(model.nric(x + step) - z) / step.max() for step in steps], axis=1)
+    steps = _steps(model)
+    z, *moved = model.nric_nearby(x, steps)
+    return np.stack([(there - z) / step for there, step in zip(moved, steps, strict=True)], axis=1)
 
 
 def factor_derivatives(model: Decoder, x: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.fit_constraints import FitConstraints
 from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted
-from shapespace.model.fit_search import ROUGH, SOLVED, FitSearch, SearchAccuracy
+from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, SearchAccuracy
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import FitOptions
 from shapespace.model.placement import QUICK, THOROUGH, PlacementEffort, StartPlacement, evenly, start_placements
@@ -39,8 +39,10 @@ class ScanFitSettings:
         random_shapes: from this number of random shapes.
         shape_points: number of points of a start shape that are compared with the scan.
         coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
-        first_steps, more_steps, last_steps: iterations for every start, for the two best, and for the best with solved
-            shapes.
+        rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
+        behind: in the last round, a second start takes part if it costs at most this multiple of the best.
+        middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
+        again_steps: steps with few points that pull unmatched parts together, if the result is poor.
         attempts: attempts to move a limb of the model to an unmatched limb of the scan,
         attempt_steps: with this number of iterations each,
         drawn_steps: of which this number pulls the limb by target points.
@@ -61,9 +63,11 @@ class ScanFitSettings:
     shape_points: int = 150
     coarse_vertices: int = 500
     fine_vertices: int = 2000
-    first_steps: int = 4
-    more_steps: int = 6
-    last_steps: int = 10
+    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.6, 2), (0.0, 4))
+    behind: float = 1.5
+    middle_steps: int = 8
+    last_steps: int = 6
+    again_steps: int = 10
     attempts: int = 4
     attempt_steps: int = 9
     drawn_steps: int = 4
@@ -179,7 +183,8 @@ class _Fit:
             rough = self._search(reconstruct, self.scan, self.constraints, ROUGH)
             best, others = self._roughly(rough, QUICK, *([THOROUGH] if self.constraints.partial else []))
             full = self._search(reconstruct, self.scan, self.constraints, SOLVED)
-            final, rival = self._fully(full, best, others)
+            middle = self._search(reconstruct, self.scan, self.constraints, MIDDLE)
+            final, rival = self._fully(middle, full, best, others)
             self.ended = self._late
             ratio = None
             posterior = self._posterior(full, final)
@@ -188,10 +193,11 @@ class _Fit:
                 flip = np.array([-1, 1, 1])
                 scan = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
                 constraints = replace(self.constraints, places=self.constraints.places * flip)
-                twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK)
+                twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK, limit=best.cost)
                 ratio = twin.cost / best.cost
         # The solver is returned first: decoding the result needs a solver too.
-        return self._answer(full, final, posterior, explained, seen, ratio, rival, rough.count)
+        counts = full.count + middle.count, rough.count
+        return self._answer(full, final, posterior, explained, seen, ratio, rival, counts)
 
     @property
     def _late(self) -> bool:
@@ -230,40 +236,52 @@ class _Fit:
             raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
         return sorted(starts, key=lambda start: start.score)[: effort.count]
 
-    def _roughly(self, search: FitSearch, *efforts: PlacementEffort) -> tuple[FitState, list[FitState]]:
-        """Return the best fit with rough shapes, and other fits; take the next effort only if all fits are poor."""
+    def _roughly(
+        self, search: FitSearch, *efforts: PlacementEffort, limit: float = np.inf
+    ) -> tuple[FitState, list[FitState]]:
+        """Return the best fit with rough shapes, and other fits.
+
+        The next effort follows only if all fits are poor. A best fit that costs more than ``limit`` gets no attempts.
+        """
         states: list[FitState] = []
+        base: FitState | None = None
         for effort in efforts:
             states = sorted([*states, *self._followed(search, effort)], key=lambda state: state.cost)
             for k in range(SETTINGS.attempts):
-                if self._late or not self._is_poor(*search.shares(states[0])):
+                if self._late or states[0].cost > limit or not self._is_poor(*search.shares(states[0])):
                     return states[0], states[1:]
                 # Continue twice from the best fit, then from the other fits.
-                base = states[0] if k < 2 or k - 1 >= len(states) else states[k - 1]
-                again = search.run(base, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
-                if again.cost < states[0].cost:
-                    states[0] = again
+                before, base = base, states[0] if k < 2 or k - 1 >= len(states) else states[k - 1]
+                if base is not before:  # otherwise it would end in the same place
+                    again = search.run(base, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
+                    states[0] = min(states[0], again, key=lambda state: state.cost)
         return states[0], states[1:]
 
     def _followed(self, search: FitSearch, effort: PlacementEffort) -> list[FitState]:
         """Return fits with rough shapes from the start placements, the best first."""
-        begun = [
-            search.start(self.codes[start.shape], start.placement, self.shapes[start.shape])
+        states = [
+            FitState(self.codes[start.shape], self.shapes[start.shape], start.placement)
             for start in self._placed(search, effort)
         ]
-        states = [search.run(state, SETTINGS.first_steps, first=True) for state in begun if state is not None]
-        states.sort(key=lambda state: state.cost)
-        states[:2] = [search.run(state, SETTINGS.more_steps, first=True) for state in states[:2]]
-        return sorted(states, key=lambda state: state.cost)
+        for part, steps in SETTINGS.rounds:
+            some = states[: max(2, round(part * len(states)))]
+            if part == 0 and some[-1].cost > SETTINGS.behind * some[0].cost:
+                some.pop()
+            states[: len(some)] = [search.run(state, steps, first=True) for state in some]
+            states.sort(key=lambda state: state.cost)
+        return states
 
-    def _fully(self, search: FitSearch, best: FitState, others: list[FitState]) -> tuple[FitState, FitState | None]:
+    def _fully(
+        self, middle: FitSearch, search: FitSearch, best: FitState, others: list[FitState]
+    ) -> tuple[FitState, FitState | None]:
         """Return the best fit with solved shapes, and another fit that is nearly as good, if there is one."""
-        begun = search.start(best.code, best.placement, best.shape)
+        begun = middle.start(best.code, best.placement, best.shape)
         if begun is None:
             return best, None
-        final = search.run(begun, SETTINGS.last_steps, first=False)
+        final = search.run(middle.run(begun, SETTINGS.middle_steps, first=False), SETTINGS.last_steps, first=False)
         if not self._late and self._is_poor(*search.shares(final)):
-            again = search.run(final, SETTINGS.last_steps, first=False, drawn=SETTINGS.drawn_steps)
+            again = middle.run(final, SETTINGS.again_steps, first=False, drawn=SETTINGS.drawn_steps)
+            again = search.run(again, SETTINGS.last_steps, first=False)
             final = again if again.cost < final.cost else final
         for other in others[: SETTINGS.rivals]:
             if (
@@ -275,7 +293,7 @@ class _Fit:
             begun = search.start(other.code, other.placement, other.shape)
             if begun is None:
                 continue
-            rival = search.run(begun, SETTINGS.last_steps // 2, first=False)
+            rival = search.run(begun, SETTINGS.last_steps - 1, first=False)
             if (
                 self._apart(rival, final) > SETTINGS.elsewhere
                 and rival.cost <= SETTINGS.nearly * final.cost + SETTINGS.beside
@@ -310,7 +328,7 @@ class _Fit:
         seen: float,
         mirrored: float | None,
         rival: FitState | None,
-        rough: int,
+        counts: tuple[int, int],
     ) -> Fitted:
         decoder, options = self.decoder, self.options
         code, inside = decoder.latents.code(state.code.tolist(), Bounds.ALLOW)
@@ -343,8 +361,8 @@ class _Fit:
             samples=posterior.sample(decoder.latents, code, options.samples, options.seed),
             sampled=self.scan.sampled,
             used=np.column_stack([self.unit * self.scan.points, to_model]) if options.used else None,
-            solved=search.count + 1,
-            rough=rough,
+            solved=counts[0] + 1,
+            rough=counts[1],
         )
 
     def _status(

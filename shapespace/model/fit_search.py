@@ -1,7 +1,7 @@
 """The search of a fit: robust weights, and joint Gauss–Newton steps of code, motion and size."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import sparse
@@ -38,10 +38,10 @@ class SearchSettings:
     last_sliding: float = 0.01
     longest: float = 1.5  # longest step, in standard deviations of the population
     turn: float = 0.5  # largest rotation in a step, in radians
-    shortest: float = 0.01  # a shorter step ends the search, in standard deviations of the population,
-    still: float = 2e-4  # and so does a movement of the shape by less than this length
+    shortest: float = 0.01  # a shorter step ends the search, in standard deviations of the population
     # derivatives are used again until the code has moved this far, in standard deviations of the population
-    kept: float = 0.3
+    kept: float = 0.8
+    tolerance: float = 1e-4  # solved shapes have converged if no vertex moves further
     landmark: float = 0.01  # default standard deviation of a landmark
     # points within this distance of the model count as explained; at most twice this distance with noise
     near: float = 0.01
@@ -58,21 +58,18 @@ SETTINGS = SearchSettings()
 class SearchAccuracy:
     """How accurately a search computes shapes."""
 
-    # shapes from face frames on the coarse mesh with the factors' derivatives, instead of solved shapes on the fine
-    # mesh with derivatives of the composite
-    rough: bool
-    points: int  # number of points of the scan, and of vertices of the model, that count
+    # the fine mesh takes derivatives of the composite, the coarse mesh derivatives of the factors
+    mesh: MeshChoice
+    rough: bool  # shapes from face frames instead of solved shapes
+    points: int  # number of points of the scan that count
+    still: float  # a movement of the shape by less than this length ends the search, as a fraction of the diagonal
     floor: float  # smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes
     independent: float  # share of the points that count as independent observations
 
-    @property
-    def mesh(self) -> MeshChoice:
-        """Mesh that the search looks at."""
-        return MeshChoice.COARSE if self.rough else MeshChoice.FINE
 
-
-ROUGH = SearchAccuracy(True, 500, 5e-3, 0.1)
-SOLVED = SearchAccuracy(False, 4000, 3e-4, 0.5)
+ROUGH = SearchAccuracy(MeshChoice.COARSE, True, 500, 2e-4, 5e-3, 0.1)
+MIDDLE = SearchAccuracy(MeshChoice.COARSE, False, 1000, 5e-4, 3e-4, 0.5)
+SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, 0.5)
 
 
 class FitSearch:
@@ -100,12 +97,13 @@ class FitSearch:
         )
         self._diagonal = decoder.reference.diagonal
         self._whiten: FloatArray = np.asarray(np.linalg.inv(constraints.prior.root), np.float64)
-        self.shapes = SearchedShapes(decoder, reconstruct, deadline, rough=accuracy.rough)
-        self._changes: Callable[[Decoder, FloatArray], FloatArray] = (
-            factor_derivatives if accuracy.rough else derivatives
-        )
+        self._reconstruct = reconstruct
+        self._changes = derivatives if accuracy.mesh is MeshChoice.FINE else factor_derivatives
+        self._shapes = SearchedShapes(decoder, reconstruct, deadline, SETTINGS.tolerance, rough=accuracy.rough)
         self.count = 0  # number of shapes computed so far
         self._fields: tuple[FloatArray, FloatArray] | None = None
+        self._paired = WeakKeyDictionary[Placement, Pairs]()
+        self._shared: tuple[FitState, tuple[float, float]] | None = None
 
     def start(self, code: FloatArray, placement: Placement, like: FloatArray) -> FitState | None:
         """Return the state of a code that is placed like a shape (V, 3), or None where the networks overflow."""
@@ -175,13 +173,16 @@ class FitSearch:
         fine = self._decoder.finer(self._accuracy.mesh)
         return fine.prolong(shapes) if fine else shapes
 
-    def _shape(self, code: FloatArray) -> FloatArray | None:
+    def _shape(self, code: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
         self.count += 1
-        shape = self.shapes(code)
+        shape = self._shapes(code, near)
         return shape if np.isfinite(shape).all() else None
 
     def _pairs(self, state: FitState) -> Pairs:
-        return self._pairing.closest(self.surface(state.shape), state.placement)
+        """Return pairs of a state, kept as long as its placement; each state has its own placement."""
+        if state.placement not in self._paired:
+            self._paired[state.placement] = self._pairing.closest(self.surface(state.shape), state.placement)
+        return self._paired[state.placement]
 
     def tolerance(self, sigma: float) -> float:
         """Return the largest distance from the surface at which a point counts as explained."""
@@ -190,11 +191,14 @@ class FitSearch:
 
     def shares(self, state: FitState) -> tuple[float, float]:
         """Return the share of the scan that is explained and the share of the model's area that is seen."""
+        if self._shared is not None and self._shared[0] is state:
+            return self._shared[1]
         most, surface = self.tolerance(state.sigma), self.surface(state.shape)
         explained = surface.closest(state.placement.back(self.scan.points)).distances <= most
         away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
         areas = vertex_areas(surface.vertices, surface.vertex_faces.faces)
-        return float(explained.mean()), float(areas @ (away <= most) / areas.sum())
+        self._shared = state, (float(explained.mean()), float(areas @ (away <= most) / areas.sum()))
+        return self._shared[1]
 
     def _sigma(self, pairs: Pairs, state: FitState) -> float:
         """Return the standard deviation of the heights, from their median, which outliers do not affect."""
@@ -219,20 +223,16 @@ class FitSearch:
         """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
         if self._fields is not None and np.abs(self._whiten @ (state.code - self._fields[0])).max() <= SETTINGS.kept:
             return self._fields[1]
-        changes = self._changes(self._decoder, state.code)[:, self.constraints.movable]
-        raw = self.shapes(state.code)
-        fields = self.shapes.derivatives(state.code, changes)
-        turned = align(raw, state.shape, carried=raw + fields) - state.shape
-        moves = carried(self._decoder, self._fine, state.shape, turned)
+        moved = self._changes(self._decoder, state.code)[:, self.constraints.movable]
+        fields = self._reconstruct.differential(state.shape, moved.T)
+        moves = carried(self._decoder, self._fine, state.shape, fields)
         found = np.ascontiguousarray(np.moveaxis(moves, 0, -1))
         self._fields = state.code, found
         return found
 
     def _motions(self, pairs: Pairs, state: FitState) -> FloatArray:
         """Return derivatives (n, 3, f + 6 or 7) of the model's points by code, rotation, translation and size."""
-        fields = self._derivatives(state)
-        by_code = (pairs.rows @ fields.reshape(len(fields), -1)).reshape(len(pairs.gaps), 3, -1)
-        return np.concatenate([by_code, self._rigid(pairs.places)], axis=2)
+        return np.concatenate([pairs.carried(self._derivatives(state)), self._rigid(pairs.places)], axis=2)
 
     def _rigid(self, places: FloatArray) -> FloatArray:
         """Return derivatives (n, 3, 6 or 7) of points (n, 3) by rotation, translation and size."""
@@ -261,7 +261,7 @@ class FitSearch:
         """Return the matrix (l, V) that computes landmarks as means of the mesh's vertices."""
         fine, vertices = self._decoder.finer(MeshChoice.FINE), self.constraints.landmarks
         count = len(self._vertex_faces.around)
-        if fine and self._accuracy.rough:
+        if fine and self._accuracy.mesh is MeshChoice.COARSE:
             return sparse.csr_array(fine.prolong.weights[vertices][:, :count])
         own = np.arange(len(vertices))
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
@@ -301,15 +301,16 @@ class FitSearch:
         )
         step, change = step / longest, change / longest
         code = state.code + change
-        shape = self._shape(code)
+        predicted = state.shape + self._coarse_move(state, change)
+        shape = self._shape(code, predicted)
         if shape is None:
             return None
         # The new shape is moved to where the derivatives have led: it was solved in another frame.
-        led = align(shape, state.shape + self._coarse_move(state, change))
+        led = align(shape, predicted)
         turn, shift = Rotation.from_rotvec(step[count : count + 3]).as_matrix(), step[count + 3 : count + 6]
         motion = Placement(turn, shift, float(np.exp(step[count + 6])) if self.constraints.free else 1.0)
         moved = float(np.abs(np.einsum("nxp,p->nx", A, step)).max()) / self._diagonal
-        settled = bool(np.abs(score).max() <= SETTINGS.shortest or moved <= SETTINGS.still)
+        settled = bool(np.abs(score).max() <= SETTINGS.shortest or moved <= self._accuracy.still)
         return FitState(code, led, state.placement.after(motion), settled=settled, moved=moved)
 
     def _coarse_move(self, state: FitState, change: FloatArray) -> FloatArray:

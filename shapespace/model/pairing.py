@@ -1,7 +1,7 @@
 """Pairs of corresponding points of a scan and a model's surface, for the steps of a fit."""
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,8 @@ class Pairs:
     gaps: FloatArray  # (n, 3) vectors from the model's points to the scan's points
     normals: FloatArray  # (n, 3) normals of the model
     distances: FloatArray  # (n,) distances of the points
-    rows: sparse.csr_array  # (n, V) sparse matrix that computes the model's points as means of its vertices
+    corners: IntArray  # (n, 3) vertices of the model
+    barycentric: FloatArray  # (n, 3) weights of these vertices in the model's points
     places: FloatArray  # (n, 3) points of the model
     agree: FloatArray  # (n,) agreement of the normals, from 0 to 1
     mass: FloatArray  # (n,) share of the surface that each pair represents; pairs from the scan sum to 1
@@ -36,6 +37,13 @@ class Pairs:
     def heights(self) -> FloatArray:
         """Signed distance (n,) of the scan's points from the model's tangent planes."""
         return (self.gaps * self.normals).sum(axis=1)
+
+    def carried(self, fields: FloatArray) -> FloatArray:
+        """Return the model's points (n, 3, f) in vertex fields (V, 3, f)."""
+        flat, count = fields.reshape(len(fields), -1), len(self.corners)
+        starts = np.arange(0, 3 * count + 1, 3)
+        rows = sparse.csr_array((self.barycentric.ravel(), self.corners.ravel(), starts), (count, len(flat)))
+        return np.asarray(rows @ flat).reshape(count, *fields.shape[1:])
 
 
 class Pairing:
@@ -58,26 +66,26 @@ class Pairing:
         corners = surface.vertex_faces.faces[found.faces]
         own = unit(np.einsum("nk,nkx->nx", found.barycentric, surface.vertex_normals[corners]))
         n, k = len(points), len(self._vertices) if self._both else 0
-        rows = [(found.barycentric.ravel(), np.repeat(np.arange(n), 3), corners.ravel())]
-        agree = self._alike(normals, own, some.trust)
-        parts = [(points - found.places, own, found.distances, found.places, agree, np.full(n, 1 / n))]
+        agree, mass = self._alike(normals, own, some.trust), np.full(n, 1 / n)
+        gaps = points - found.places
+        parts = [(gaps, own, found.distances, corners, found.barycentric, found.places, agree, mass)]
         if k:
             places, across = surface.vertices[self._vertices], surface.vertex_normals[self._vertices]
-            _, nearest = nearest_points(self.scan.tree, placement(places))
-            gaps = placement.back(self.scan.points[nearest]) - places
             # Gaps to the nearest scan point include the points' spacing, so distances are measured from the planes.
-            distances = self.scan.distances(placement(places)) / placement.scale
+            distances, nearest = self.scan.nearest(placement(places))
+            gaps = placement.back(self.scan.points[nearest]) - places
             there, trust = self.scan.normals[nearest] @ placement.rotation, self.scan.trust[nearest]
             agree = self._alike(there, across, trust)
             if self._blended:
                 across = _blended(across, there, trust)
-            rows.append((np.ones(k), n + np.arange(k), self._vertices))
-            parts.append((gaps, across, distances, places, agree, np.full(k, 1 / k)))
+            corners, weights = np.repeat(self._vertices[:, None], 3, axis=1), np.tile([1.0, 0.0, 0.0], (k, 1))
+            distances, mass = distances / placement.scale, np.full(k, 1 / k)
+            parts.append((gaps, across, distances, corners, weights, places, agree, mass))
         columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-        gaps, across, distances, places, agree, mass = columns
-        values, row, column = (np.concatenate(each) for each in zip(*rows, strict=True))
-        matrix = sparse.csr_array((values, (row, column)), shape=(n + k, len(surface.vertices)))
-        return Pairs(gaps, across, distances, matrix, places, agree, mass, n, np.zeros(n + k, bool))
+        gaps, across, distances, corners, weights, places, agree, mass = columns
+        return Pairs(
+            gaps, across, distances, corners, weights, places, agree, mass, of_scan=n, drawn=np.zeros(n + k, bool)
+        )
 
     def drawn(self, pairs: Pairs, surface: MeshProximity, placement: Placement, most: float) -> Pairs:
         """Pair scan points farther away than ``most`` with parts of the model that the scan does not show.
@@ -95,13 +103,12 @@ class Pairing:
             _, back = nearest_points(cKDTree(points[far]), vertices[unseen])
             replaced.append((pairs.of_scan + unseen, self._vertices[unseen], points[far[back]]))
         index, own, goal = (np.concatenate(each) for each in zip(*replaced, strict=True))
-        rows, found = pairs.rows.tolil(), deepcopy(pairs)
-        rows[index] = 0
-        rows[index, own] = 1
+        found = deepcopy(pairs)
+        found.corners[index], found.barycentric[index] = own[:, None], [1.0, 0.0, 0.0]
         found.places[index], found.normals[index] = surface.vertices[own], surface.vertex_normals[own]
         found.gaps[index] = goal - found.places[index]
         found.distances[index], found.agree[index], found.drawn[index] = 0, 1, True
-        return replace(found, rows=rows.tocsr())
+        return found
 
     def _alike(self, normals: FloatArray, others: FloatArray, trust: FloatArray) -> FloatArray:
         """Return the agreement (n,) of model and scan normals (n, 3), from 0 to 1, weighted by the scan's ``trust``."""

@@ -17,6 +17,8 @@ MOST, PLANES = 3000, 10_000
 FEWEST, NEIGHBOURS = 10, 16
 #: Neighbours have no plane if the ratio of their smallest to their middle moment exceeds the inverse of this number.
 CLOUDY = 4
+#: Number of points from which the correlation of residuals is computed.
+CORRELATED = 600
 #: A scan whose thickness is less than this share of its extent lies in a plane.
 FLAT = 1e-6
 #: Points farther from the median than this multiple of the median distance are strays.
@@ -60,14 +62,18 @@ class Scan:
         return away[:, -1]
 
     def distances(self, places: FloatArray) -> FloatArray:
-        """Return distances (n,) of places (n, 3) from the surface that the points represent.
+        """Return distances (n,) of places (n, 3) from the surface that the points represent."""
+        return self.nearest(places)[0]
+
+    def nearest(self, places: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return distances (n,) of places (n, 3) from the surface that the points represent, and the nearest points.
 
         Near a point this is the distance from the point's plane, elsewhere the distance from the point.
         """
         away, nearest = nearest_points(self.tree, places)
         above = np.abs(((places - self.points[nearest]) * self.normals[nearest]).sum(axis=1))
         beside = np.sqrt(np.maximum(away**2 - above**2, 0))
-        return np.where(beside <= self.gaps[nearest], above, away)
+        return np.where(beside <= self.gaps[nearest], above, away), nearest
 
 
 def nearest_points(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[FloatArray, IntArray]:
@@ -87,8 +93,9 @@ def independent_points(points: FloatArray, residuals: FloatArray, weights: Float
     if len(points) < 50:
         return 1.0
     residuals = np.clip(residuals, *(np.quantile(residuals, [0.01, 0.99])))
-    _, beside = nearest_points(cKDTree(points), points, min(len(points) // 4, 200))
-    products = (residuals[:, None] * residuals[beside[:, 1:]]).mean(axis=0) / (residuals**2).mean()
+    # The order of points is random, so the first ones represent all.
+    _, beside = nearest_points(cKDTree(points), points[:CORRELATED], min(len(points) // 4, 200))
+    products = (residuals[:CORRELATED, None] * residuals[beside[:, 1:]]).mean(axis=0) / (residuals**2).mean()
     # Moving averages, because single neighbours are noisy.
     smooth = np.convolve(products, np.ones(5) / 5, mode="valid")
     below = np.flatnonzero(smooth < 0.05)

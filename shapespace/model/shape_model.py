@@ -206,7 +206,7 @@ class ShapeModel:
                 f"{len(missed)} of {len(ended)} shapes did not converge; the first is that of code {missed[0]}: "
                 f"{ended[missed[0]]}",
                 RuntimeWarning,
-                stacklevel=2,
+                stacklevel=3,  # the decorator's frame lies between,
             )
         return positions if values.ndim == 2 else positions[0]
 

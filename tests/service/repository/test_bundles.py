@@ -509,7 +509,7 @@ def test_what_nobody_expected_is_a_line_as_well(
         assert repository.reload() == Changes(refused=["b"])
         assert [model.manifest.name for model in repository] == ["a", "b", "c"]
         assert repository.signature()
-    assert "Permission denied" in messages(caplog)[0]
+    assert "you may not read or write there" in messages(caplog)[0]
     assert repository.reload() == Changes()
 
 
