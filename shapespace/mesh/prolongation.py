@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -22,7 +23,6 @@ from shapespace.mesh.triangle_mesh import (
     TriangleMesh,
     diagonal,
     face_normals,
-    faces_at_vertices,
 )
 
 #: Weight of a vertex normal relative to the weight of an edge, in the fit of a vertex' local affine map.
@@ -37,6 +37,12 @@ FITTED_VECTORS = 2**20
 ROUNDING = 1e-15
 #: Fine vertices that are bound to faces at a time: each is compared with dozens of faces, which takes memory.
 BOUND_VERTICES = 10_000
+
+
+def faces_at_vertices(faces: IntArray, count: int) -> sparse.csr_array:
+    """Return the matrix (V, F) with 1 where a vertex belongs to a face, for `count` vertices."""
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return sparse.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
 class ProlongationError(ValueError):

@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.vectors import components, cross, unit
@@ -212,12 +211,6 @@ def vertex_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
     """Compute the areas (V,) of the vertices of a shape (V, 3): a third of each face around."""
     thirds = np.repeat(face_areas(vertices, faces) / 3, 3)
     return np.bincount(faces.ravel(), thirds, minlength=len(vertices)).astype(np.float64, copy=False)
-
-
-def faces_at_vertices(faces: IntArray, count: int) -> sparse.csr_array:
-    """Return the matrix (V, F) with 1 where a vertex belongs to a face, for `count` vertices."""
-    columns = np.repeat(np.arange(len(faces)), 3)
-    return sparse.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
 def on_shared_vertices(

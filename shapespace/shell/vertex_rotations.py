@@ -4,7 +4,8 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray
-from shapespace.mesh.triangle_mesh import Connectivity, faces_at_vertices
+from shapespace.mesh.prolongation import faces_at_vertices
+from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.vectors import components, cross, dot
 
 
