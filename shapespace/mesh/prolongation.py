@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -39,10 +38,10 @@ ROUNDING = 1e-15
 BOUND_VERTICES = 10_000
 
 
-def faces_at_vertices(faces: IntArray, count: int) -> sparse.csr_array:
+def faces_at_vertices(faces: IntArray, count: int) -> sp.csr_array:
     """Return the matrix (V, F) with 1 where a vertex belongs to a face, for `count` vertices."""
     columns = np.repeat(np.arange(len(faces)), 3)
-    return sparse.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
+    return sp.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
 class ProlongationError(ValueError):
