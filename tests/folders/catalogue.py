@@ -268,7 +268,8 @@ FOLDERS = [
     Folder("a file removed", of_all(lambda meshes: meshes), r"data: 1 removed \(pose7\.obj\)", later=remove),
     Folder("a duplicate", of_one(lambda shape: figures()[0][2]), r"pose4\.obj: has every vertex where pose2\.obj"),
     Folder("turned", of_one(lambda shape: shape @ UP), r"pose4\.obj: is turned against the others"),
-    Folder("a mirrored sheet", mirrored_head, r"pose4\.obj: is a mirror image", odd=NAME),
+    # Samples of such a collection may fail so often that the run stops, as in 0.2.
+    Folder("a mirrored sheet", mirrored_head, r"pose4\.obj: is a mirror image", (0, 1), odd=NAME),
     Folder("a vertex far off", of_one(moved(77, [0, 1, 9])), r"pose4\.obj: has a vertex far off: 78", odd=NAME),
     Folder("size accepted", of_one(lambda shape: 1000 * shape), SIZE, (0, 1), ("--accept", "pose4.obj"), back=np.inf),
     Folder("order accepted", of_one(exchanged(60)), SOME, (0, 1), ("--accept", "pose4"), back=np.inf),
