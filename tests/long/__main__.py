@@ -69,6 +69,12 @@ TESTS = {
         (f"env FAULT_SEEDS={{SEEDS}} {WHOLE} tests/faults",),
         {"SEEDS": "20"},
     ),
+    "busy": LongTest(
+        "run the whole suite RUNS times beside four processes that keep the processors busy",
+        ("tests",),
+        ("python -m tests.long.busy {RUNS}",),
+        {"RUNS": "5"},
+    ),
     "server": LongTest(
         "the slow tests of running servers: floods, timeouts, crowds, attacks and proxies",
         ("service", "deploy", "Dockerfile"),
