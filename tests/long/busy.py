@@ -21,7 +21,6 @@ def main(runs: int) -> bool:
     command = [sys.executable, "-m", "pytest", "-q", "--dist", "loadfile", "--no-loadscope-reorder"]
     command += ["--numprocesses", os.environ.get("JOBS", "3")]
     good = [subprocess.run(command, check=False).returncode == 0 for _ in range(runs)]
-    print(f"{sum(good)} of {runs} runs passed beside {BUSY} busy processes")
     return all(good)
 
 
