@@ -67,8 +67,8 @@ class Config(SettingsTable):
     def _usable_correction(self) -> Config:
         if self.networks.combiner.correction.kind == "field" and self.collection.generator != "freaky-torus":
             raise ValueError(
-                'networks: kind = "field" is for features that move over the surface, which only the generator '
-                "freaky-torus has"
+                'networks: kind = "field" needs features that move over the surface, which only the generator '
+                'freaky-torus has; choose "auto"'
             )
         return self
 
@@ -82,7 +82,7 @@ def parse(text: str, source: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        words = {"extra_forbidden": "there is no such setting here"}
+        words = {"extra_forbidden": "there is no such setting here; remove it or correct its spelling"}
         faults = [(".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors()]
         lines = [f"{source}: these settings can't be used", *(": ".join(filter(None, fault)) for fault in faults)]
         raise ConfigError("\n  ".join(lines)) from error
@@ -100,7 +100,7 @@ def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"{path}: can't be read: it is no text in UTF-8; name a configuration, CONFIG.toml"
+            f"{path}: can't be read: it is not text in UTF-8; name a configuration, CONFIG.toml"
         ) from error
     except OSError as error:
         hint = "; init writes a configuration for a folder of meshes" if path.is_dir() else ""

@@ -123,7 +123,7 @@ class ConvolutionSettings(SettingsTable):
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
         if self.crop and self.neighbourhood != "flaps":
-            raise ValueError("crop needs the neighbourhood flaps")
+            raise ValueError('crop needs neighbourhood = "flaps"')
         if self.products and not self.residual:
             raise ValueError("products need residual = true")
         return self

@@ -102,7 +102,7 @@ REQUESTS = {
     "colours in STL": get(f"{MESH}?color=stretch&format=stl", 406, "not-acceptable", "STL files can't carry colours"),
     "no coloured format": get(f"{MESH}?color=stretch", 406, "not-acceptable", "ply", Accept="model/stl"),
     "unknown colours": get(f"{MESH}?color=heat", 422, "invalid-request",  "'stretch', 'bending' or 'spread' for color"),
-    "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "Add color=stretch or bending"),
+    "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "only for color=stretch"),
     "colours against text": get(f"{MESH}?color=bending&against=x", 422, "invalid-request", "?against=0.1,0.2"),
     "colours against a short code": post(
         f"{MESH}?color=bending&against=1", {"latent": OK}, 422, "wrong-length", "Send exactly 3"

@@ -78,9 +78,9 @@ def _one_file(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("build", "says"),
     [
-        (_with_a_note, "holds notes.txt, which no export wrote"),
-        (_meshes, "holds pose.obj, which no export wrote"),
-        (_other_manifest, "holds manifest.json, which no export wrote"),
+        (_with_a_note, "holds notes.txt, which no export has written"),
+        (_meshes, "holds pose.obj, which no export has written"),
+        (_other_manifest, "holds manifest.json, which no export has written"),
         (_one_file, "is no folder"),
     ],
 )

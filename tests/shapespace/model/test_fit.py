@@ -239,7 +239,7 @@ def test_what_is_no_such_shape_is_told_so(request: pytest.FixtureRequest, name: 
     found = request.getfixturevalue(name).fit_scan((solids[solid].vertices, solids[solid].faces))
     assert found.status is FitStatus.POOR
     assert found.explained < 0.9
-    assert "no such shape" in found.reason
+    assert "not a shape of this model" in found.reason
 
 
 @pytest.mark.parametrize("known", ["landmarks", pytest.param("fixed", marks=pytest.mark.long)])

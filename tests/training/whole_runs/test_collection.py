@@ -80,8 +80,8 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     }
     assert all(1e-6 < part["mean"] < part["max"] < 0.02 for part in parts.values())
     said = (run.parent / "said.txt").read_text()
-    assert "3 separate parts: the model computes with 'Bar'" in said
-    assert "Eye is carried rigidly: " in said
+    assert "3 separate parts: the model predicts 'Bar'" in said
+    assert "Eye is attached and moves rigidly" in said
     report = (run / "report.html").read_text()
     assert "<html" in report
     assert "Eye, attached, moves rigidly" in report
