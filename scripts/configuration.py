@@ -20,7 +20,7 @@ HEAD = """\
 Every setting of a file for `shapespace-train run`, by its TOML table. `shapespace-train init` writes a file with the
 settings that most people change. A setting marked *required* has to be there. `run` refuses unknown settings.
 
-NRIC are the lengths and dihedral angles of all edges of a shape. The networks predict them.
+The [glossary](glossary.md) explains words such as *mode*, *factor* and *NRIC*.
 """
 NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
 
