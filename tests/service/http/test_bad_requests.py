@@ -88,7 +88,7 @@ REQUESTS = {
     "a path beyond floats": post(PATHS, {"keyframes": [OK, [0, 0, 0]], "stop": 1e300}, 422, "not-finite", "finite"),
     "too long a path": post(PATHS, {"keyframes": LONG_PATH}, 422, "path-too-long", "Send fewer keyframes"),
     "unknown model": get("/v1/models/large", 404, "unknown-model", "/v1/models lists"),
-    "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "Choose one"),
+    "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "lists the models"),
     "a way out of the folder": get("/v1/models/..%2fsmall/mesh", 404, "not-found", "/openapi.json"),
     "unknown version": get(f"{MODEL}?version=3", 404, "unknown-version", "Choose one of 1, 2, 10"),
     "no version": get(f"{MODEL}?version=new", 404, "unknown-version", "Choose one of 1, 2, 10"),

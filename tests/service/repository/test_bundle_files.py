@@ -81,7 +81,7 @@ def _one_file(folder: Path) -> None:
         (_with_a_note, "holds notes.txt, which no export has written"),
         (_meshes, "holds pose.obj, which no export has written"),
         (_other_manifest, "holds manifest.json, which no export has written"),
-        (_one_file, "is no folder"),
+        (_one_file, "is not a folder"),
     ],
 )
 def test_a_folder_that_holds_anything_else_is_not_replaced(

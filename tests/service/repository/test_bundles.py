@@ -317,7 +317,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     ),
     "packed in another way": (
         bytes_of(GEOMETRY, put_in_directory(10, *(14).to_bytes(2, "little")), sealed=True),  # LZMA
-        "geometry.npz is not a readable NPZ file: vertices.npy is packed in a way",
+        "geometry.npz is not a readable NPZ file: vertices.npy is compressed in a way",
     ),
 }
 

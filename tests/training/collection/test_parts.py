@@ -194,7 +194,7 @@ def test_init_selects_parts_by_name(tmp_path: Path) -> None:
 def test_init_selects_the_largest_part_where_not_all_can_be_kept(tmp_path: Path) -> None:
     count = with_specks(tmp_path / "specks.npz")
     out, meshes = write(tmp_path / "specks.npz", tmp_path / "c.toml")
-    assert any("where 100 are allowed" in note for note in meshes.notes)
+    assert any("at most 100 are allowed" in note for note in meshes.notes)
     assert "only the largest" in out.read_text()
     sizes = listed_parts(out.read_text())
     assert len(sizes) == 121
