@@ -103,7 +103,7 @@ def decide(
     if media_type not in _ANY_TYPE:
         if media_types.get(media_type) not in formats:
             raise FormatError(
-                f"has no known format: {clipped(media_type)} is not the extension of a format that can be read"
+                f"has no known format: {clipped(media_type)} is not the media type of a format that can be read"
             )
         return Assumed(media_types[media_type], "its media type")
     if found := _by_lines(data):

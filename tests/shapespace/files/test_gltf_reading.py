@@ -298,7 +298,7 @@ REFUSED: dict[str, tuple[bytes | dict[str, Any], str]] = {
     "sparse without a view": (accessor(sparse={"count": 1, "indices": {}, "values": {}}), "not a readable glb"),
     "no data": (document(accessors=[HOLLOW] * 2), "accessor 0 has no data"),
     "Draco": (document(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression, which"),
-    "several": (document(extensionsRequired=["KHR_materials_unlit", "A", "B"]), "requires A, B, which is not read"),
+    "several": (document(extensionsRequired=["KHR_materials_unlit", "A", "B"]), "requires A, B, which can't be read"),
     "lines": (primitive_with(mode=1), "points or lines"),
     "indices beyond": (accessor(count=3), "vertices 0 to 3, but there are 3"),
     "two corners": (accessor(1, count=2), "2 corners make no triangles"),
@@ -315,13 +315,13 @@ REFUSED: dict[str, tuple[bytes | dict[str, Any], str]] = {
     "flat positions": (accessor(type="VEC2"), "a wrong type"),
     "a projection": (document(nodes=[{"mesh": 0, "matrix": [1, 0, 0, 0.5, *MATRIX[4:]]}]), "the last row of a matrix"),
     "fifteen numbers": (document(nodes=[{"mesh": 0, "matrix": MATRIX[1:]}]), "16 numbers are needed"),
-    "glTF 1": (document(asset={"version": "1.0"}), "it is glTF 1.0, and 2 is read"),
+    "glTF 1": (document(asset={"version": "1.0"}), "it has glTF version 1.0, but only version 2"),
     "no mesh": (document(nodes=[{"name": "camera"}]), "holds no mesh"),
     "many places": (document(nodes=[{"mesh": 0}] * 1001, scenes=[{"nodes": [*range(1001)]}]), "more than 1000 parts"),
-    "GLB 1": (b"glTF\1\0\0\0" + glb(document(), BINARY)[8:], "it is GLB 1, and 2 is read"),
-    "cut short": (glb(document(), BINARY)[:-40], "and has"),
+    "GLB 1": (b"glTF\1\0\0\0" + glb(document(), BINARY)[8:], "it has GLB version 1, but only version 2"),
+    "cut short": (glb(document(), BINARY)[:-40], "but has"),
     "no JSON": (b"glTF" + bytes(100), "damaged"),
-    "a list": (glb([1, 2]), "no object"),
+    "a list": (glb([1, 2]), "not an object"),
 }  # fmt: skip
 
 

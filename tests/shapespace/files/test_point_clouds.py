@@ -74,7 +74,7 @@ REFUSED = {
         "counts the points, but not in line 501",
     ),
     "nothing": ("", "line 1 is ''"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is no text"),
+    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is not text"),
 }
 
 
@@ -133,7 +133,7 @@ def test_pcd_is_read(kind: str) -> None:
     ("content", "says"),
     [
         (pcd("binary", ROWS.tobytes()[:-4]), "not a readable pcd file"),
-        (pcd("zipped", ROWS.tobytes()), "are zipped, which is not read"),
+        (pcd("zipped", ROWS.tobytes()), "are zipped, which can't be read"),
         (pcd("binary", ROWS.tobytes(), fields="rgb a b c"), "not x, y and z"),
         (pcd("ascii", b"9 1 2 3\n"), "have 3 points, but has 1"),
         (pcd("binary_compressed", struct.pack("<II", 4, 48) + b"\xff\xff\xff\xff"), "damaged"),

@@ -173,7 +173,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
         ply_head("binary_little_endian", "element vertex 2", *XYZ) + bytes(23),
         "says 2 rows of vertex",
     ),
-    "PLY: no z": ("ply", ply_head("ascii", "element vertex 1", *XYZ[:2]) + b"0 0\n", "no x, y and z"),
+    "PLY: no z": ("ply", ply_head("ascii", "element vertex 1", *XYZ[:2]) + b"0 0\n", "lack x, y and z"),
     "PLY: a type nobody knows": (
         "ply",
         ply_head("ascii", "element vertex 1", "property real x"),

@@ -108,7 +108,7 @@ def test_damaged_results_are_named_and_made_again(config: Path, tmp_path: Path, 
     assert "samples/part-00001.npz: is damaged and was removed; the stage samples computes it again" in words
     np.testing.assert_equal(NpzFile(part).read(), arrays)
     RunDirectory(out).stamp("samples").path.write_bytes(b"damaged")
-    assert "stages/samples.json: damaged" in said(*run, "samples")
+    assert "stages/samples.json: is damaged" in said(*run, "samples")
     np.testing.assert_equal(NpzFile(part).read(), arrays)
 
 
