@@ -39,7 +39,7 @@ def test_values_come_from_the_meshes(tmp_path: Path) -> None:
     assert config.collection.data == folder.resolve()
     assert config.collection.reference is None
     assert f'"{collection.names[collection.central]}", the most central' in out.read_text()
-    assert "24 at most" in out.read_text()
+    assert "at most 24" in out.read_text()
     assert (config.export.name, config.export.title) == ("my-meshes-2", "My Meshes_2")
     assert "coarse_vertices" not in config.collection.model_fields_set
 
