@@ -17,9 +17,10 @@ TARGET = Path(__file__).parents[1] / "docs" / "reference" / "configuration.md"
 HEAD = """\
 # Configuration
 
-Every setting of a file for `shapespace-train run`, by its TOML table. `make configuration` writes this page from
-`training/runs/settings.py` and `network_settings.py`. A setting without a default has to be there; unknown ones are
-refused.
+Every setting of a file for `shapespace-train run`, by its TOML table. `shapespace-train init` writes a file with the
+settings that most people change. A setting marked *required* has to be there. `run` refuses unknown settings.
+
+The [glossary](glossary.md) explains words such as *mode*, *factor* and *NRIC*.
 """
 NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
 

@@ -29,9 +29,9 @@ def parser() -> CommandParser:
     """Return the parser of the command line, which has no arguments but ``--help`` and ``--version``."""
     return CommandParser(
         prog="shapespace-serve",
-        description="Serve the models of a folder over HTTP.",
-        epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT say where to listen, and "
-        "SHAPESPACE_MODELS_DIR names the folder. docs/reference/settings.md lists all.",
+        description="Start the server: web page and HTTP interface for the models of a folder.",
+        epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT set the address, and "
+        "SHAPESPACE_MODELS_DIR the folder of models. docs/reference/settings.md lists all settings.",
         advice="Settings are environment variables, as in: SHAPESPACE_HOST=127.0.0.1 SHAPESPACE_PORT=8001 "
         "shapespace-serve",
     )
@@ -83,17 +83,23 @@ def _serve(validator: BundleValidator) -> None:
     logs.configure(settings.log_format)
     log = logging.getLogger(__name__)
     for name in unknown_variables():
-        log.warning("%s is no setting: docs/reference/settings.md lists all settings", name)
+        log.warning("%s is not a setting and has no effect: docs/reference/settings.md lists all settings", name)
     if settings.models_dir == BUNDLED:
-        log.info("serving what is installed with the package; a folder models or SHAPESPACE_MODELS_DIR gives others")
+        log.info(
+            "serving the models of the package, because there is no folder models here; SHAPESPACE_MODELS_DIR "
+            "names another folder"
+        )
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the server can reload
     # Uvicorn raises the signal again after the shutdown, which is a success.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))
     if settings.api_key is None and not is_loopback(settings.host):
-        log.warning("there is no key (SHAPESPACE_API_KEY): whoever reaches %s may call", settings.host)
+        log.warning(
+            "there is no API key, so everybody who reaches %s may call: set SHAPESPACE_API_KEY to require a key",
+            settings.host,
+        )
     elif settings.api_key is not None and len(settings.api_key.get_secret_value()) < SHORT_KEY:
-        log.warning("SHAPESPACE_API_KEY is short: a good one is what `openssl rand -hex 16` prints")
+        log.warning("SHAPESPACE_API_KEY is short and may be guessed: make a better key with `openssl rand -hex 16`")
     Server(create_app(settings, validator), settings).run()
 
 

@@ -48,7 +48,7 @@ class DefaultVersions:
             if separator:
                 name = before.strip()
                 if not re.fullmatch(NAME_PATTERN, name):
-                    raise DefaultVersionsError(f"{name[:64]!r} is no name of a model. {EXAMPLE}.")
+                    raise DefaultVersionsError(f"{name[:64]!r} is not the name of a model. {EXAMPLE}.")
                 if name in given:
                     raise DefaultVersionsError(f"{name} is named twice. Name each model once.")
                 given[name] = []
@@ -65,7 +65,9 @@ class DefaultVersions:
         except FileNotFoundError:
             return cls()
         except UnicodeDecodeError:
-            raise DefaultVersionsError(f"{file.name} is no text in UTF-8. {EXAMPLE}, one model on each line.") from None
+            raise DefaultVersionsError(
+                f"{file.name} is not text in UTF-8. {EXAMPLE}, one model on each line."
+            ) from None
         except OSError as error:
             raise DefaultVersionsError(f"{file.name} can't be read: {error.strerror}.") from None
         try:
@@ -137,13 +139,13 @@ def _shares(name: str, entries: list[str]) -> dict[int, float]:
     for entry in entries:
         version, separator, share = (part.strip() for part in entry.partition(":"))
         if not re.fullmatch(VERSION_PATTERN, version):
-            raise DefaultVersionsError(f"{name}={entry[:64]} has no version, which is a whole number. {EXAMPLE}.")
+            raise DefaultVersionsError(f"{name}={entry[:64]} names no version. A version is a whole number. {EXAMPLE}.")
         if int(version) in shares:
             raise DefaultVersionsError(f"{name} names version {version} twice. Name each version once.")
         if not separator and len(entries) > 1:
             raise DefaultVersionsError(f"{name} names several versions. Give each a share: {EXAMPLE[6:]}.")
         if separator and not re.fullmatch(r"[0-9]{1,3}(\.[0-9]+)?", share):
-            raise DefaultVersionsError(f"{name}={entry[:64]} has no share in per cent. {EXAMPLE}.")
+            raise DefaultVersionsError(f"{name}={entry[:64]} names no share in per cent. {EXAMPLE}.")
         shares[int(version)] = float(share) if separator else _WHOLE
     if not math.isclose(total := sum(shares.values()), _WHOLE):
         raise DefaultVersionsError(f"The shares of {name} add up to {total:g} per cent. Let them add up to 100.")

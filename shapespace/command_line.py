@@ -34,7 +34,7 @@ class CommandParser(argparse.ArgumentParser):
 def missing_packages(modules: Sequence[str], extra: str) -> str:
     """Return a sentence about modules that aren't installed and the extra that has them; empty if all are there."""
     missing = ", ".join(name for name in modules if not _is_installed(name))
-    return f"needs {missing}, not installed here: pip install 'shapespace[{extra}]'" if missing else ""
+    return f"needs {missing}, which is not installed here: pip install 'shapespace[{extra}]'" if missing else ""
 
 
 def _is_installed(module: str) -> bool:

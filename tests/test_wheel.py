@@ -175,7 +175,7 @@ def test_the_figure_is_served_from_an_empty_folder(installed: Path, tmp_path: Pa
         _, log = server.communicate(timeout=60)
     expected = load(ROOT / "models" / "figure").decode(np.full((1, 20), 0.3))
     np.testing.assert_array_equal(np.array(answer.json()["vertices"], np.float32), expected.astype(np.float32))
-    assert "serving what is installed with the package" in log
+    assert "serving the models of the package" in log
     assert not any(tmp_path.iterdir())
 
 

@@ -26,47 +26,82 @@ def _add_command(commands: Any, name: str, purpose: str) -> CommandParser:
 
 def parser() -> CommandParser:
     """Return the parser of the command line."""
-    top = CommandParser(prog="shapespace-train", description="Learn a shape manifold and export its bundle.")
+    top = CommandParser(
+        prog="shapespace-train", description="Train a model on your meshes and export it for the server."
+    )
     commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
 
     start = _add_command(commands, "init", "write a configuration for a folder of meshes in correspondence")
-    start.add_argument("meshes", type=Path, metavar="MESH_DIR", help="OBJ, PLY, STL, OFF or glTF files, or one NPZ")
-    start.add_argument("--out", type=Path, metavar="FILE.toml", help="default: the folder's name, here")
-    start.add_argument("--file", metavar="NAME", help="file to read from each folder in MESH_DIR, one for each subject")
+    start.add_argument(
+        "meshes",
+        type=Path,
+        metavar="MESH_DIR",
+        help="folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ or GLB file with all shapes",
+    )
+    start.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE.toml",
+        help="file to write (default: the folder's name with .toml, in the current folder)",
+    )
+    start.add_argument(
+        "--file",
+        metavar="NAME",
+        help="read this file from each folder in MESH_DIR, for data with one folder per subject",
+    )
     start.add_argument(
         "--parts",
         nargs="+",
         default=[],
         metavar="NAME",
-        help="parts to keep, the main one first",
+        help="names of the parts to keep, the main part first",
     )
-    start.add_argument("--force", action="store_true", help="replace the file if it is there")
+    start.add_argument("--force", action="store_true", help="replace FILE.toml if it exists")
 
-    run = _add_command(commands, "run", "do the stages of a configuration that are not done yet")
+    run = _add_command(
+        commands, "run", "train the model of a configuration; a repeated command continues where the last one stopped"
+    )
     run.add_argument("config", type=Path, metavar="CONFIG.toml")
-    run.add_argument("--data", type=Path, metavar="DIR", help="folder of meshes or NPZ file, instead of the config's")
-    run.add_argument("--out", type=Path, metavar="DIR", help="run directory (default: runs/ and the config's name)")
-    run.add_argument("--until", choices=STAGE_NAMES, metavar="STAGE", help=f"last stage: {', '.join(STAGE_NAMES)}")
-    run.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers draw the samples")
+    run.add_argument(
+        "--data",
+        type=Path,
+        metavar="DIR",
+        help="folder of meshes or NPZ file, instead of collection.data in CONFIG.toml",
+    )
+    run.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results (default: runs/ and the name of CONFIG.toml)"
+    )
+    run.add_argument(
+        "--until", choices=STAGE_NAMES, metavar="STAGE", help=f"stop after this stage: {', '.join(STAGE_NAMES)}"
+    )
+    run.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers compute the samples"
+    )
     run.add_argument(
         "--accept",
         nargs="+",
         action="extend",
         default=[],
         metavar="FILE",
-        help="take these shapes though their size or the order of their vertices is another than that of the others",
+        help="use these shapes although their size or vertex order differs from the others",
     )
     run.add_argument(
-        "--keep-going", action="store_true", help="go on where more than a quarter of logarithms or samples are lost"
+        "--keep-going",
+        action="store_true",
+        help="continue even if more than a quarter of the logarithms or samples fail",
     )
 
     status = _add_command(commands, "status", "show which stages of a run are done")
-    report = _add_command(commands, "report", "write RUN/report.html, pictures and figures of what is done so far")
+    report = _add_command(
+        commands, "report", "write RUN/report.html, with pictures and figures of all stages that are done"
+    )
     export = _add_command(commands, "export", "finish a run and write its bundle again")
     for command in (status, report, export):
         command.add_argument("run", type=Path, metavar="RUN")
     for command in (run, export):
-        command.add_argument("--models", type=Path, default=Path("models"), help="where bundles go (default: models)")
+        command.add_argument(
+            "--models", type=Path, default=Path("models"), help="folder for the finished bundle (default: models)"
+        )
     return top
 
 

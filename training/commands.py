@@ -80,7 +80,10 @@ def _serving(models: Path) -> str:
 def _open(folder: Path, models: Path) -> Run:
     directory = RunDirectory(folder)
     if not directory.is_run():
-        raise ConfigError(f"{folder} is no run directory: it holds no config.toml")
+        raise ConfigError(
+            f"{folder} is not a run directory: it has no config.toml; name a folder that run has "
+            "written, such as runs/NAME"
+        )
     refuse_old(directory)
     return Run(folder, *load(directory.config.path), models)
 
@@ -95,7 +98,7 @@ def _init(arguments: argparse.Namespace) -> None:
         print(f"  {note}")
     accept = " ".join(shlex.quote(collection.names[warning.shape]) for warning in collection.warnings if warning.grave)
     if accept:
-        print(f"A run would stop at {accept}: mend or remove these, or take them as they are with --accept {accept}")
+        print(f"A run would stop at {accept}: correct or remove it, or use it as it is with --accept {accept}")
     print(f"Next: {_program()} run {_here(out)}")
 
 
@@ -106,7 +109,7 @@ def _run(arguments: argparse.Namespace) -> None:
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
     _execute(run, arguments.until, keep_going=arguments.keep_going, command=again)
     if arguments.until not in (None, "export"):
-        print(f"Done up to {arguments.until}; the same command without --until goes on from there")
+        print(f"Done up to {arguments.until}. The same command without --until continues from there")
     else:
         print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
 
@@ -187,14 +190,13 @@ def carry_out(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         workers.stop()
-        print("\nshapespace-train: stopped; the same command continues here", file=sys.stderr)
+        print("\nshapespace-train: stopped. The same command continues from here", file=sys.stderr)
         return 128 + received[0]  # as shells report the end by a signal
     except Exception as error:
         what = " ".join(str(error).split())[:300]
         print(
-            f"shapespace-train: something went wrong that should not have: {type(error).__name__}: {what}\n"
-            f"Please report it with {_here(_keep_traceback(arguments))}, which says where; the same command tries the "
-            "stage again",
+            f"shapespace-train: internal error: {type(error).__name__}: {what}\n"
+            f"Please report it, and attach {_here(_keep_traceback(arguments))}. The same command tries the stage again",
             file=sys.stderr,
         )
         return DEFECT

@@ -22,8 +22,8 @@ from shapespace.service.use_cases.forms import OPTIONS
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
 DESCRIPTION = """\
-Learned product shape manifolds of triangle meshes. Small networks map a latent code to edge lengths and
-dihedral angles. Gauss–Newton finds the mesh with these lengths and angles.
+Models that turn a few numbers, the latent code, into a triangle mesh. Small networks map the code to edge lengths
+and dihedral angles. Gauss–Newton finds the mesh with these lengths and angles.
 
 Coordinates are in the units of the training meshes, indices start at 0, every mesh is rigidly aligned to the
 model's reference. Every error is a problem (RFC 9457) whose `detail` says what to do.
@@ -45,8 +45,8 @@ _FORM = "multipart/form-data"
 _OPTIONS = {
     "type": "string",
     "contentMediaType": "application/json",
-    "description": "Parameters of the query as one JSON object, which may be a file. Each may also be a field of its "
-    "name. Fields have priority over the query.",
+    "description": "Parameters of the query as one JSON object, which may be a file. A field with the name of a "
+    "parameter does the same. Fields override the query.",
 }
 #: Models of bodies that FastAPI does not see, in addition to the models of JSONBody.
 _MODELS: tuple[type[BaseModel], ...] = (IndexRequest, InferenceRequest, Problem)
@@ -109,7 +109,7 @@ def binary(media_types: Mapping[str, str], description: str, *, cached: bool = T
         200: {"description": description, "content": others, "headers": headers}
     }
     if cached:
-        answers[304] = {"description": "The client has this answer already, as `If-None-Match` says."}
+        answers[304] = {"description": "The client already has this answer, according to `If-None-Match`."}
     return answers
 
 

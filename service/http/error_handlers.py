@@ -122,7 +122,7 @@ async def _validation(request: Request, error: Exception) -> Response:
 
 #: How to correct a fault that pydantic found, by its type.
 _ADVICE = {
-    "extra_forbidden": "Remove {name!r}: there is no such field. /openapi.json lists those there are.",
+    "extra_forbidden": "Remove {name!r}: there is no such field. /openapi.json lists all fields.",
     "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
     "list_type": "Send a list for {name}.",
     "too_short": "Send at least {min_length} entries for {name}, not {actual_length}.",

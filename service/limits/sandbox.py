@@ -112,7 +112,7 @@ class Sandbox:
             SandboxError: one of those of `sandbox_errors`, as the cause is.
         """
         if not self._free.acquire(timeout=max(0.0, deadline.time - time.monotonic())):
-            raise LateError("every process was at work until the time was over")
+            raise LateError("every process was busy until the deadline")
         try:
             child = self._take(task)
             try:
@@ -259,10 +259,10 @@ class _Child:
             if deadline.passed:
                 raise LateError(f"it took longer than {max(round(seconds, 1), 0):g} s") from None
             if str(error) == "bad message length":
-                raise DiedError("it answered what can't be read") from None
+                raise DiedError("its answer can't be read") from None
             raise self._exit_error() from None
         except (ValueError, TypeError, LookupError, RecursionError):
-            raise DiedError("it answered what can't be read") from None
+            raise DiedError("its answer can't be read") from None
 
     def _exit_error(self) -> SandboxError:
         try:
@@ -273,9 +273,9 @@ class _Child:
             return DiedError(f"it ended with status {status}")
         name = signal.Signals(-status).name
         if name == "SIGXCPU":
-            return LateError("it took more of the processor's time than there was")
+            return LateError("it took more processor time than allowed")
         if name == "SIGKILL":
-            return OutOfMemoryError("the system killed it, as it does where memory runs out")
+            return OutOfMemoryError("the system killed it, probably because memory ran out")
         return DiedError(f"it died of {name}")
 
     def kill(self) -> None:
@@ -299,6 +299,6 @@ def _raise(reply: Mapping[str, Any]) -> None:
         case None:
             return
         case "memory":
-            raise OutOfMemoryError("it takes more memory than it may have")
+            raise OutOfMemoryError("it needs more memory than allowed")
         case error:
             raise FailedError(str(error), str(reply["sentence"])[:LONGEST_SENTENCE])

@@ -28,7 +28,7 @@ SEARCH_GRACE_SECONDS = 5.0
 #: Bytes that all answers with many shapes may use together.
 MEMORY = 384 * 2**20
 #: What a client can do whose request was not answered by its deadline.
-ADVICE = "Ask for fewer shapes at once, stream the frames as JSON lines, or try again when there is less to do."
+ADVICE = "Ask for fewer shapes at once, stream the frames as JSON lines, or try again when the server is less busy."
 
 
 class BusyError(RuntimeError):

@@ -48,14 +48,18 @@ class Metrics:
         self._reloads = counter("reloaded_bundles", text, "result")
         self._refusals = counter("refusals", "Connections that were refused without a whole request.", "kind")
         for name, text, value in (
-            ("bundles_refused", "Bundles that the latest look refused.", lambda: len(repository.refused)),
-            ("default_version_faults", "Default versions that can't be answered.", lambda: len(repository.faults)),
+            ("bundles_refused", "Bundles that the latest reload refused.", lambda: len(repository.refused)),
+            ("default_version_faults", "Default versions that are not served.", lambda: len(repository.faults)),
             ("admitted", "Requests at work or waiting for a worker.", lambda: workers.places.used),
-            ("admitted_limit", "Requests that may be; more get 503.", lambda: workers.places.limit),
-            ("streams", "Answers that are read while they are computed.", lambda: workers.streams.used),
-            ("streams_limit", "Such answers that may be; more get 503.", lambda: workers.streams.limit),
+            (
+                "admitted_limit",
+                "Limit of requests at work or waiting; further requests get 503.",
+                lambda: workers.places.limit,
+            ),
+            ("streams", "Streams of JSON lines that are open.", lambda: workers.streams.used),
+            ("streams_limit", "Limit of open streams; further streams get 503.", lambda: workers.streams.limit),
             ("connections", "Open connections.", lambda: connections.used),
-            ("connections_limit", "Connections that may be open.", lambda: connections.limit),
+            ("connections_limit", "Limit of open connections.", lambda: connections.limit),
             ("workers", "Shapes computed at once.", lambda: workers.threads),
         ):
             Gauge(f"shapespace_{name}", text, registry=registry).set_function(value)

@@ -31,7 +31,7 @@ class Reloader:
             try:
                 changes = await asyncio.to_thread(self._repository.reload)
             except Exception:
-                logger.exception("the reload failed, so that nothing changes")
+                logger.exception("the reload failed, so nothing changes")
                 changes = Changes(failed=True)
             self._metrics.reloaded(changes)
             numbers = map(len, (changes.loaded, changes.removed, changes.refused))

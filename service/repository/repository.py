@@ -107,7 +107,7 @@ class ModelRepository:
         try:
             folders, unreadable = bundle_folders(self._folder)
         except OSError as error:
-            logger.error("the models folder can't be read, so that nothing changes: %s", in_words(error))
+            logger.error("the models folder can't be read, so nothing changes: %s", in_words(error))
             self._serve(self._served[0])
             return Changes(failed=True)
         changes = Changes()
@@ -134,11 +134,11 @@ class ModelRepository:
                 if model is None:
                     logger.error("bundle %s is not served: %s", place, _reason(error))
                 else:
-                    logger.error("bundle %s is refused, and what was loaded before stays: %s", place, _reason(error))
+                    logger.error("bundle %s is refused, and the bundle loaded before stays: %s", place, _reason(error))
                     serve(model)
         for folder, fault in unreadable.items():
             changes.refused.append(printable(folder.name))
-            logger.error("%s can't be read, so that it stays as it was: %s", printable(folder.name), in_words(fault))
+            logger.error("%s can't be read, so it stays as it was: %s", printable(folder.name), in_words(fault))
             for key in [key for key in before if key[0] == folder.name]:
                 serve(before.pop(key))
         for name, version in before:
@@ -245,7 +245,7 @@ class ModelRepository:
 def _named(name: str, models: Models) -> Mapping[int, ShapeModel]:
     if name not in models:
         known = ", ".join(sorted(models)) or "none at the moment"
-        raise UnknownModelError(f"There is no model {name!r}. Choose one of those that /v1/models lists: {known}.")
+        raise UnknownModelError(f"There is no model {name!r}. /v1/models lists the models: {known}.")
     return models[name]
 
 
@@ -262,7 +262,7 @@ def _reason(error: Exception) -> str:
     """Return the fault of a bundle in one line."""
     match error:
         case FailedError(kind=FailedError.UNEXPECTED) | DiedError() | LateError() | OutOfMemoryError():
-            text = f"tried in a process of its own, {error}"
+            text = f"loaded in a separate process, {error}"
         case SandboxError() | BundleError():
             text = str(error)
         case OSError():

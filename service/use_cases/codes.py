@@ -44,7 +44,7 @@ SCAN_LIMITS, SCAN_MEMORY = Limits(2**21, 2**21), 256 * 2**20
 #: Bytes of a reading process's answer beside the arrays.
 _ANSWER = 2**16
 #: Advice for a search that has no result at its deadline: for `encode` and `edit`, and for `fit`.
-_LATER = "Try again when there is less to do."
+_LATER = "Try again when the server is less busy."
 _SMALLER = f"Fit fewer points or a coarser scan. {_LATER}"
 
 
@@ -318,15 +318,17 @@ def read_upload(
     except FailedError as error:
         if error.kind in UPLOAD_ERRORS:
             raise UPLOAD_ERRORS[error.kind](error.sentence) from None
-        logger.error("an uploaded file breaks its reader: %s", error.sentence)
+        logger.error("the reader of an uploaded file crashed: %s", error.sentence)
         raise _unusable("it breaks its reader") from None
     except LateError:
         raise DeadlineError("The file was not read in time. Send a smaller one.") from None
     except NoProcessError as error:
         logger.error("uploads can't be read: %s", error)
-        raise BusyError("No process can be had to read the file. Try again after Retry-After.") from None
+        raise BusyError(
+            "The server can't start a process to read the file. Try again after the time in Retry-After."
+        ) from None
     except OutOfMemoryError:
-        raise _unusable("reading it takes more memory than a mesh of this model does") from None
+        raise _unusable("reading it takes more memory than a mesh of this model needs") from None
     except ClosedError as error:
         raise EndingError("The server is about to end. Send the file to another one.") from error
     except SandboxError as error:

@@ -22,7 +22,7 @@ def _by_index(given: object) -> object:
     if isinstance(given, dict):
         for index, value in given.items():
             if not re.fullmatch("[0-9]{1,6}", str(index)):
-                raise ValueError(f'{str(index)[:20]!r} is no index; send numbers by index, as in {{"3": 0.5}}')
+                raise ValueError(f'{str(index)[:20]!r} is not an index; send numbers by index, as in {{"3": 0.5}}')
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise ValueError(f"the value at {index} is not a finite number")
     return given
@@ -47,5 +47,5 @@ class Body(BaseModel):
     @classmethod
     def _of_few_members(cls, given: object) -> object:
         if isinstance(given, dict) and len(given) > _MEMBERS:
-            raise ValueError(f"it has {len(given)} members; /openapi.json lists those there are")
+            raise ValueError(f"it has {len(given)} members; /openapi.json lists the possible ones")
         return given

@@ -86,7 +86,7 @@ def _text(part: FormPart) -> str:
     try:
         return str(as_utf8(part.data), "utf-8")
     except ValueError:
-        raise FormFieldError(f"The field {part.name!r} is no text. Send it in UTF-8.") from None
+        raise FormFieldError(f"The field {part.name!r} is not text in UTF-8. Send it in UTF-8.") from None
 
 
 def _unreadable(why: str, remedy: str = "Send one file in it.") -> UnreadableFormError:

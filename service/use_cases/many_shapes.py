@@ -137,7 +137,9 @@ async def infer(
         shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
     )
     if size > BYTES_PER_VERTEX * MOST_VERTICES:
-        raise TooManyCodesError(f"{len(codes)} codes are too many for both outputs. Ask for each by itself, or fewer.")
+        raise TooManyCodesError(
+            f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes."
+        )
     caller = replace(caller, long=len(codes) > SHORT_INFERENCE)
     async with batch(workers, caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}

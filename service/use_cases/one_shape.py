@@ -69,7 +69,7 @@ def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> F
     with np.errstate(over="ignore", invalid="ignore"):
         moved = place(there)
         if not np.isfinite(moved.astype(np.float32)).all():
-            raise NotFiniteError("place takes the shape so far away that the numbers overflow. Send smaller ones.")
+            raise NotFiniteError("place moves the shape so far away that the numbers overflow. Send smaller numbers.")
     return moved
 
 

@@ -129,6 +129,6 @@ async def sequence_lines(
 def _require_frames(animation: Animation, most: int) -> None:
     if animation.frames > most:
         raise TooManyFramesError(
-            f"frames is {animation.frames}; the limit is {most}. Ask for fewer, or for "
-            "parts of the path by start and stop."
+            f"frames is {animation.frames}; the limit is {most}. Ask for fewer frames, or for parts of the path with "
+            "start and stop."
         )

@@ -65,9 +65,9 @@ SHAPE_FORMATS = {
 }
 #: Reason why a format may be missing on a server.
 UNAVAILABLE = dict.fromkeys(
-    USD_FORMATS, "This server can't write USD, for which it needs the package usd-core: pip install usd-core"
+    USD_FORMATS, "This server can't write USD, because it lacks the package usd-core: pip install usd-core"
 ) | dict.fromkeys(
-    VTK_FORMATS, 'This server can\'t write VTK files, for which it needs the package vtk: pip install "shapespace[vtk]"'
+    VTK_FORMATS, 'This server can\'t write VTK files, because it lacks the package vtk: pip install "shapespace[vtk]"'
 )
 
 
@@ -82,8 +82,8 @@ def catch_write_errors() -> Iterator[None]:
         yield
     except OSError:
         raise NoRoomError(
-            "The server has no room for the temporary file that USD takes. Ask for another format, or give it a "
-            "folder for such files that can be written to (TMPDIR)."
+            "The server has no room for the temporary file of USD. Ask for another format, or set TMPDIR of the "
+            "server to a writable folder."
         ) from None
 
 

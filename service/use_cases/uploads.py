@@ -116,16 +116,18 @@ def read_mesh_files(
         file, fields = read_form(body, options.get(b"boundary"), known)
         if file is None:
             raise UnusableMeshError(
-                "The form holds no file. Send the mesh file as one of its fields, with a file name: -F file=@mesh.obj"
+                "The form has no file. Send the mesh file as a field with a file name: -F file=@mesh.obj"
             )
         data, name, media_type = file.data, file.file_name or "", file.media_type
     if not data:
-        raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file of a form.")
+        raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file in a form.")
     accepted = ", ".join((*formats, ARCHIVE))
     try:
         found = _format(data, (*formats, ARCHIVE), fields.get("format") or format, name, media_type)
     except FormatError as error:
-        sentence = f"The file {str(error).rstrip('.')}. Send one of {accepted}. ?format= says which it is."
+        sentence = (
+            f"The file {str(error).rstrip('.')}. Send one of {accepted}. If it is one of these, name it with ?format=."
+        )
         raise UnknownFormatError(sentence) from None
     try:
         if found.name == ARCHIVE:
@@ -135,7 +137,7 @@ def read_mesh_files(
         fault = str(error).rstrip(".") + (_looks_otherwise(data, found) if found.because == _GIVEN else "")
         raise UnusableMeshError(
             f"The mesh can't be used: {fault}. The server read it as {found.name}, as {found.because} says. "
-            f"Send one {found.name} file, or by ?format= another of {accepted}."
+            f"Send a correct {found.name} file. If it has another format, name it with ?format=: {accepted}."
         ) from None
 
 

@@ -54,7 +54,7 @@ def from_entry(entry: AttributesEntry, arrays: Mapping[str, NDArray], textures: 
 
     def labels(names: list[str], of: NDArray | None, kind: str) -> Labels | None:
         if bool(names) != (of is not None):
-            raise MeshError(f"names of {kind} and the polygons that have them go together")
+            raise MeshError(f"there are names of {kind} without polygons that have them, or the reverse")
         return None if of is None else Labels(tuple(names), of)
 
     starts, corners = whole("starts"), whole("corners")

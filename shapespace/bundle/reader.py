@@ -49,7 +49,9 @@ class Bundle(Geometry):
 def check_place(folder: Path) -> None:
     """Raise BundleError unless a folder is called NAME/VERSION."""
     if not re.fullmatch(NAME_PATTERN, folder.parent.name) or not re.fullmatch(VERSION_PATTERN, folder.name):
-        raise BundleError("a bundle lies in NAME/VERSION: a name in small letters, a version that is a whole number")
+        raise BundleError(
+            "a bundle must be in a folder NAME/VERSION, with a name in small letters and a whole number as version"
+        )
 
 
 def manifest_digest(folder: Path) -> str:
@@ -65,7 +67,7 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     name, version = folder.parent.name, folder.name
     text = _manifest(folder)
     if digest not in (None, hashlib.sha256(text).hexdigest()):
-        raise BundleError("it changed while it was tried")
+        raise BundleError("its files changed while the server tested it")
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
@@ -118,7 +120,7 @@ def _read(path: Path, limit: int) -> bytes:
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode) or status.st_size > limit:
-            raise BundleError(f"{path.name} is longer than {limit} bytes")
+            raise BundleError(f"{path.name} has more than {limit} bytes")
         return file.read(status.st_size + 1)  # not the limit, because a manifest can declare a terabyte
 
 
@@ -136,7 +138,7 @@ def _geometry(content: bytes, manifest: Manifest, textures: Mapping[str, bytes])
     try:
         total, most = sum(header.nbytes for header in npz_headers(content).values()), UNPACKED * len(content) + BESIDE
         if total > most:
-            raise BundleError(f"{file}: its arrays would come to {total} bytes, where {most} are the most")
+            raise BundleError(f"{file}: its arrays would have {total} bytes, but at most {most} are allowed")
         arrays = read_npz(content)
     except BundleError:
         raise
@@ -157,7 +159,7 @@ def _check_network(file: str, content: bytes) -> None:
     for tensor in [*_tensors_of_graph(model.graph), *_tensors_of_nodes(functions)]:
         name = tensor.name or "a tensor"
         if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
-            raise BundleError(f"{file}: {name} keeps its data in another file")
+            raise BundleError(f"{file}: {name} has its data in another file")
         try:
             values = onnx.numpy_helper.to_array(tensor)
         except Exception as error:  # an unknown type, or too few data

@@ -80,9 +80,9 @@ def require_replaceable(folder: Path) -> None:
             raise BundleError(f"{parent} is a file, and bundles lie in a folder: choose another folder for them")
     if not os.path.lexists(folder):
         return
-    remedy = "nothing is replaced there: move it away, or choose another folder, name or version for the bundle"
+    remedy = "nothing was replaced: move it away, or choose another folder, name or version for the bundle"
     if folder.is_symlink() or not folder.is_dir():
-        raise BundleError(f"{folder} is no folder, so {remedy}")
+        raise BundleError(f"{folder} is not a folder, so {remedy}")
     present = {path.name for path in folder.iterdir()}
     try:
         own = {MANIFEST, *json.loads((folder / MANIFEST).read_bytes())["files"]} if MANIFEST in present else set()
@@ -90,7 +90,7 @@ def require_replaceable(folder: Path) -> None:
         own = set()
     if others := sorted(present - own):
         named = ", ".join(map(clipped, others[:3])) + (", …" if len(others) > 3 else "")
-        raise BundleError(f"{folder} holds {named}, which no export wrote, so {remedy}")
+        raise BundleError(f"{folder} holds {named}, which no export has written, so {remedy}")
 
 
 def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geometry) -> Path:

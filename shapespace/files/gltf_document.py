@@ -60,9 +60,9 @@ def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
     if (magic, kind) != (b"glTF", b"JSON"):
         raise ValueError("damaged, or another kind of file")
     if version != 2:
-        raise MeshError(f"it is GLB {version}, and 2 is read")
+        raise MeshError(f"it has GLB version {version}, but only version 2 can be read")
     if not 20 + size <= length <= len(data):
-        raise ValueError(f"it says {length} bytes, and has {len(data)}")
+        raise ValueError(f"it should have {length} bytes, but has {len(data)}")
     text, rest = data[20 : 20 + size], data[20 + size : length]
     if len(rest) < 8:
         return text, None
@@ -88,7 +88,7 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
         place = stop
     tree = json.loads(b"".join([*pieces, text[place:]]))
     if not isinstance(tree, dict):
-        raise ValueError("its JSON is no object")
+        raise ValueError("its JSON is not an object")
     return tree, uris
 
 
@@ -108,11 +108,13 @@ class GltfDocument:
         self.tree = tree
         version = clipped(tree.get("asset", {}).get("version", "2.0"))
         if version.partition(".")[0] != "2":
-            raise MeshError(f"it is glTF {version}, and 2 is read")
+            raise MeshError(f"it has glTF version {version}, but only version 2 can be read")
         required = [name for name in tree.get("extensionsRequired", []) if name != _QUANTIZATION]
         unknown = [name for name in required if not name.startswith(_APPEARANCE)]
         if unknown:
-            raise MeshError(f"it requires {clipped(', '.join(unknown))}, which is not read: export it without")
+            raise MeshError(
+                f"it requires {clipped(', '.join(unknown))}, which can't be read: export it without this extension"
+            )
         kinds = ("buffers", "bufferViews", "accessors", "meshes", "nodes", "skins", "scenes")
         self.buffers, self.views, self.accessors, self.meshes, self.nodes, self.skins, self._scenes = (
             objects(tree, kind) for kind in kinds
@@ -148,7 +150,7 @@ class GltfDocument:
         while waiting:
             number, outer, depth = waiting.pop()
             if depth > _MOST_LEVELS:
-                raise MeshError(f"its nodes lie more than {_MOST_LEVELS} deep in each other")
+                raise MeshError(f"its nodes are nested more than {_MOST_LEVELS} deep")
             node = entry_at(self.nodes, number)
             inner = _matrix(node)
             places[number] = outer if inner is None else inner if outer is None else outer @ inner
@@ -178,7 +180,7 @@ class PlacedMesh:
     def joint_place(self, number: int) -> FloatArray:
         """Return the matrix (4, 4) of a joint; raises ValueError if it is not in the scene."""
         if number not in self.places:
-            raise ValueError(f"its joint {clipped(number)} is no node of the scene")
+            raise ValueError(f"its joint {clipped(number)} is not a node of the scene")
         place = self.places[number]
         return np.eye(4) if place is None else place
 
@@ -187,7 +189,7 @@ def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """Return a member that is a list of objects; raises ValueError if it is something else."""
     entries = tree.get(name, [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError(f"its {name} are no list of objects")
+        raise ValueError(f"its {name} are not a list of objects")
     return entries
 
 
@@ -263,7 +265,7 @@ class Accessor:
         if "bufferView" not in accessor and "sparse" not in accessor:
             raise MeshError(f"its accessor {index} has no data")
         if accessor["type"] != kind or accessor["componentType"] not in components:
-            raise ValueError(f"its accessor {index} is of another type than it has to be")
+            raise ValueError(f"its accessor {index} has a wrong type")
         normalized = accessor.get("normalized", False) is True
         count, sparse = _natural(accessor["count"]), accessor.get("sparse")
         if "bufferView" in accessor:
@@ -297,7 +299,7 @@ class Accessor:
             inside + (count - 1) * stride + size > length
             or start + length > _natural(entry_at(document.buffers, buffer)["byteLength"])
         ):  # fmt: skip
-            raise ValueError(f"its {name} has {count} elements, which is more than there are data")
+            raise ValueError(f"its {name} has {count} elements, but not enough data")
         return cls(buffer, start + inside, stride, count, dtype, width, normalized=False)
 
     def real(self, buffers: Buffers) -> FloatArray:

@@ -156,7 +156,7 @@ class Scene:
             return listed
         vertices: FloatArray = listed[self.first]
         if not np.array_equal(listed, vertices[self._numbers], equal_nan=True):
-            raise MeshError("its _VERTEX has one number for vertices at different places")
+            raise MeshError("its _VERTEX gives one number to vertices at different positions")
         return vertices
 
     def _vertex_numbers(self, count: int) -> IntArray:
@@ -292,7 +292,7 @@ def _placed_primitives(document: GltfDocument, *, every_target: bool) -> list[Pl
     for placed in document.placed_meshes():
         for primitive in objects(placed.mesh, "primitives"):
             if len(found) == _MOST_PRIMITIVES:
-                raise MeshError(f"its scene comes to more than {_MOST_PRIMITIVES} parts")
+                raise MeshError(f"its scene has more than {_MOST_PRIMITIVES} parts")
             found.append(_placed_primitive(document, primitive, placed, every_target=every_target))
     if not found:
         raise MeshError("holds no mesh")
@@ -351,7 +351,7 @@ def _target_names(mesh: dict[str, Any], count: int) -> list[str]:
     names = [name or f"target {k}" for k, name in enumerate(labels, 1)]
     if len(set(names)) < count:
         twice = next(name for k, name in enumerate(names) if name in names[:k])
-        raise MeshError(f"two morph targets are called {twice!r}; each needs a name of its own")
+        raise MeshError(f"two morph targets are called {twice!r}; give each its own name")
     return names
 
 

@@ -76,13 +76,13 @@ def clipped(text: object, most: int = 100) -> str:
 #: Sentences about a file or folder, by the number of the system's error.
 _SYSTEM_ERRORS = {
     errno.ENOENT: "there is no such file or folder; check its name",
-    errno.EISDIR: "it is a folder, where a file is needed",
-    errno.ENOTDIR: "it is a file or lies below one, where a folder is needed",
+    errno.EISDIR: "it is a folder, but a file is needed",
+    errno.ENOTDIR: "it is a file or lies below one, but a folder is needed",
     errno.EACCES: "you may not read or write there; change its permissions, or choose another place",
     errno.EPERM: "you may not read or write there; change its permissions, or choose another place",
     errno.EROFS: "the disk can't be written to; choose another place",
-    errno.ENOSPC: "the disk is full; make room, then give the same command again",
-    errno.EDQUOT: "the disk is full for this user; make room, then give the same command again",
+    errno.ENOSPC: "the disk is full; free some space, then give the same command again",
+    errno.EDQUOT: "your quota on this disk is full; free some space, then give the same command again",
     errno.ENAMETOOLONG: "its name is too long; choose a shorter one",
     errno.ELOOP: "its links lead back to themselves; name the file itself",
     errno.EMFILE: "too many files are open at once; raise the limit with ulimit -n",

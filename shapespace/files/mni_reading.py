@@ -41,7 +41,7 @@ def read_mni(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     head = _POLYGONS.match(data)
     if not head:
         kind = "lines" if _LINES.match(data) else "binary data"
-        raise MeshError(f"it is MNI's OBJ with {kind}, which is not read: save polygons as text")
+        raise MeshError(f"it is MNI's OBJ with {kind}, which can't be read: save polygons as text")
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # NumPy's word for text among the numbers
         try:
@@ -55,7 +55,7 @@ def read_mni(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     def take(count: int) -> FloatArray:
         nonlocal place
         if not 0 <= count <= len(numbers) - place:
-            raise ValueError("MNI's OBJ ends before all that it says is there")
+            raise ValueError("the file ends before the MNI OBJ data that it announces")
         place += count
         return numbers[place - count : place]
 
@@ -69,7 +69,7 @@ def read_mni(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     ends = take(polygons).astype(np.int64)
     sizes = np.diff(ends, prepend=0)
     if (sizes < 3).any():
-        raise ValueError("a polygon of MNI's OBJ has less than three corners")
+        raise ValueError("a polygon of MNI's OBJ has fewer than three corners")
     limits.check(0, int(sizes.sum()) - 2 * polygons)
     corners = take(int(sizes.sum())).astype(np.int64)
     # Triangles from polygons, which have their first corner in common.

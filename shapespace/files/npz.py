@@ -142,7 +142,7 @@ def _entries(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 def _header(member: IO[bytes], entry: zipfile.ZipInfo) -> ArrayHeader:
     """Read the header of an array; raises ValueError for an array that NumPy can't have written."""
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{entry.filename} is packed in a way that NumPy doesn't")
+        raise ValueError(f"{entry.filename} is compressed in a way that NumPy doesn't use")
     version = np.lib.format.read_magic(member)
     if version not in _READ_HEADER:
         raise ValueError(f"{entry.filename} is of version {version}")

@@ -54,16 +54,16 @@ def read_pcd(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     elif kind == b"binary_compressed":
         packed, size = struct.unpack_from("<II", body)
         if size != points * row.itemsize:
-            raise ValueError(f"its data have {size} bytes, and {points} points need {points * row.itemsize}")
+            raise ValueError(f"its data have {size} bytes, and {points} points need {points * row.itemsize} bytes")
         content = _decompressed(body[8 : 8 + packed], size)
         # Here each field has its values together.
         offsets = [points * sum(row[k].itemsize for k in range(axis)) for axis in axes]
         columns_of = zip(axes, offsets, strict=True)
         found = np.stack([np.ndarray((points,), row[k], content, offset)[:, 0] for k, offset in columns_of], axis=1)
     else:
-        raise MeshError(f"its data are {clipped(kind.decode(errors='replace'))}, which is not read: save it as ascii")
+        raise MeshError(f"its data are {clipped(kind.decode(errors='replace'))}, which can't be read: save it as ascii")
     if len(found) != points:
-        raise ValueError(f"it says that it has {points} points, and has {len(found)}")
+        raise ValueError(f"it should have {points} points, but has {len(found)}")
     return found[~np.isnan(found).any(axis=1)].astype(np.float64), np.zeros((0, 3), np.int64)
 
 

@@ -70,7 +70,7 @@ class PlyElement:
         """Indices of the properties x, y and z; raises ValueError if one is missing."""
         names = [p.name for p in self.properties]
         if self.lists or not {"x", "y", "z"} <= set(names):
-            raise ValueError("its vertices have lists, or no x, y and z")
+            raise ValueError("its vertices have lists, or lack x, y and z")
         return [names.index(axis) for axis in "xyz"]
 
     @property
@@ -130,7 +130,7 @@ def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
 def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None) -> PlyProperty:
     types = [np.dtype((order or "") + _DTYPES[k.decode("latin-1")]) for k in (kind, length) if k is not None]
     if length is not None and types[1].kind == "f":
-        raise ValueError("the length of a list is no whole number")
+        raise ValueError("the length of a list is not a whole number")
     return PlyProperty(name.decode("latin-1"), types[0], types[1] if length is not None else None)
 
 
@@ -205,7 +205,7 @@ class BinaryTable:
     def skip(self, element: PlyElement) -> None:
         """Skip the rows of an element."""
         if element.lists:
-            raise ValueError(f"its {clipped(element.name)} rows, before the faces, have lists")
+            raise ValueError(f"its {clipped(element.name)} rows, which come before the faces, have lists")
         self._place += self._equal_rows(element).nbytes
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:

@@ -43,11 +43,11 @@ def read_point_text(data: memoryview, limits: Limits) -> tuple[FloatArray, IntAr
     """
     text = str(as_utf8(data), "utf-8", "replace")
     if "\0" in text[:1000] or "\ufffd" in text[:100]:
-        raise ValueError("it is no text")
+        raise ValueError("it is not text")
     points, counts = _Dialect.of(text).read(text)
     limits.check(len(points), 0)
     if counts and sum(counts) != len(points):
-        raise ValueError(f"it says that it has {sum(counts)} points, and has {len(points)}")
+        raise ValueError(f"it should have {sum(counts)} points, but has {len(points)}")
     return points, np.zeros((0, 3), np.int64)
 
 
@@ -220,4 +220,4 @@ def _counts_up(numbers: FloatArray) -> bool:
 
 
 def _fault(text: str, place: int, line: str) -> ValueError:
-    return ValueError(f"line {_number(text, place)} is {quoted(line)}, and has no three numbers in front")
+    return ValueError(f"line {_number(text, place)} is {quoted(line)}, which does not begin with three numbers")

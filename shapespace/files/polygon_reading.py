@@ -22,7 +22,7 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes that are copied at once to count the lines before an error.
 _PIECE = 2**20
-ENDS_EARLY = "it ends before all that it says is there"
+ENDS_EARLY = "it ends before the data that it announces"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 #: A line of OBJ that goes on in the next one.
 _CONTINUED = re.compile(rb"\\[ \t]*\r?\n")
@@ -118,7 +118,7 @@ def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     if is_mni(start := bytes(text[:1000])):
         return read_mni(text, limits)
     if b"\0" in start:
-        raise ValueError("it is no text")
+        raise ValueError("it is not text")
     with Lines(joined_lines(text), _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
@@ -151,7 +151,7 @@ def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         if not found:
             raise ValueError("another kind of file")
         if found[1] and found[1].split()[0].upper() == b"BINARY":
-            raise MeshError("it is binary OFF, which is not read: save it as text")
+            raise MeshError("it is binary OFF, which can't be read: save it as text")
         counts = _row(lines, 1, (found[1] or b"").split())
         counts = counts if len(counts) > 1 else _row(lines, 3, counts)
         vertex_count, face_count = int(counts[0]), int(counts[1])

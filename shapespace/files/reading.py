@@ -104,7 +104,7 @@ def read_morph_file(path: Path) -> MorphShapes:
 
 def _content(path: Path) -> bytes:
     if path.exists() and not path.is_file():
-        raise MeshError("can't be read: it is no file")
+        raise MeshError("can't be read: it is not a file")
     try:
         return path.read_bytes()
     except OSError as error:

@@ -37,7 +37,7 @@ _FOREIGN = {
     "a web page: download the file itself": rb"\s*(?i:<!doctype html|<html)",
     "packed by gzip: unpack it first": rb"\x1f\x8b",
     "a 7z archive: unpack it first": rb"7z\xbc\xaf",
-    "a USD file, which is written but not read: save it as GLB or OBJ": rb"PXR-USDC|#usda",
+    "a USD file, which can be written but not read: save it as GLB or OBJ": rb"PXR-USDC|#usda",
     "an FBX file: save it as GLB or OBJ": rb"Kaydara FBX|; FBX",
     "a Blender file: export it as GLB or OBJ": rb"BLENDER",
     "a COLLADA file: save it as GLB or OBJ": rb"\s*(?:<\?xml[^>]*>\s*)?<COLLADA\b",
@@ -46,7 +46,7 @@ _FOREIGN = {
 }
 #: Members that come first in ZIP archives of other kinds.
 _FOREIGN_MEMBERS = {
-    "a USDZ file, which is written but not read: save it as GLB or OBJ": rb".*\.usd[ac]?$",
+    "a USDZ file, which can be written but not read: save it as GLB or OBJ": rb".*\.usd[ac]?$",
     "a 3MF or an office file: save it as STL or OBJ": rb"\[Content_Types\]\.xml$|_rels/",
 }
 _VERTEX = re.compile(rb"^[ \t]*[vV](?:[ \t]+" + _NUMBER + rb"){3}", re.MULTILINE)
@@ -96,11 +96,15 @@ def decide(
         return _accepted(suffix if (found, suffix) == ("zip", "npz") else found, formats)
     if suffix:
         if suffix not in formats:
-            raise FormatError(f"has no known format: .{label(suffix)} tells no format that is read here")
+            raise FormatError(
+                f"has no known format: .{label(suffix)} is not the extension of a format that can be read"
+            )
         return Assumed(suffix, "its name")
     if media_type not in _ANY_TYPE:
         if media_types.get(media_type) not in formats:
-            raise FormatError(f"has no known format: {clipped(media_type)} tells no format that is read here")
+            raise FormatError(
+                f"has no known format: {clipped(media_type)} is not the media type of a format that can be read"
+            )
         return Assumed(media_types[media_type], "its media type")
     if found := _by_lines(data):
         return _accepted(found, formats)

@@ -150,10 +150,12 @@ def _result(decimation: Decimation, target: int) -> Coarsening:
 def _reason(count: int, target: int, specks: int) -> str:
     parts = []
     if count != target:
-        why = "thin parts that could only be had with slivers are left to the fine mesh"
+        why = "thin parts are only in the fine mesh, because the coarse mesh would need slivers for them"
         if count > target:
             why = "any other collapse would change the topology, or leave a sliver or a fold in some shape"
         parts.append(f"{count} vertices instead of {target}: {why}")
     if specks:
-        parts.append(f"{specks} faces have next to no area or height in some shape, and no collapse or flip mends that")
+        parts.append(
+            f"{specks} faces have almost no area or height in some shape, and simplification can't correct that"
+        )
     return "; ".join(parts)

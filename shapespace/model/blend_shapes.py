@@ -55,7 +55,7 @@ def require_ends(model: Decoder) -> None:
     angles = [name for name, period in zip(model.latents.names, model.manifest.period, strict=True) if period]
     if angles:
         raise PeriodicError(
-            f"{model.manifest.name} has angles among its coordinates ({angles[0]}), which have no ends to blend "
+            f"{model.manifest.name} has angles among its coordinates ({angles[0]}), which have no bounds to blend "
             "between. Ask for shapes of codes, or for an animation."
         )
 

@@ -76,15 +76,15 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
             if not len(torn) and not len(more):
                 return Matched(shape, layout.mesh)
             faults.append(
-                f"Face {[*torn, *more][0]} does not meet its neighbours as in the model. Vertices may be split by flat "
-                "shading or seams of texture, or as in STL, if the faces are in the model's order."
+                f"Face {[*torn, *more][0]} does not meet its neighbours as in the model. Send the faces in the "
+                "model's order. Vertices may be split at texture seams, by flat shading, or as in STL."
             )
     if faults:
-        raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model's.")
+        raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model.")
     known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in layouts)
     raise InvalidMeshError(
         f"The mesh has {len(vertices)} vertices and {len(faces)} faces, but those of {model.manifest.name} have "
-        f"{known}. Send one in correspondence, with nothing welded, split or reordered."
+        f"{known}. Send a mesh in correspondence: nothing may be merged, split or reordered. For other meshes use fit."
     )
 
 

@@ -127,7 +127,7 @@ class Decoder:
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         self._surface = bundle.surface
         self._overflow = (
-            "The code lies so far outside the bounds that the model's numbers overflow. Choose one "
+            f"The code lies so far outside the bounds that the model's numbers overflow. Choose a code "
             f'nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
         )
         codes = self.training_codes = bundle.training_codes
@@ -337,7 +337,7 @@ class Decoder:
             self._patience = min(PATIENCE, RECOVERY * self._patience)
         except NetworkError as error:
             logger.error("model %s/%s: %s", self.manifest.name, self.manifest.version, error)
-            what_to_do = "Choose another code or model, and tell whoever runs the server."
+            what_to_do = "Choose another code or model, and tell the operator of the server."
             if isinstance(error, TerminatedError):
                 self._patience = max(patience / 2, LEAST_PATIENCE)
                 raise NetworkTimeError(

@@ -27,11 +27,11 @@ UNITS = 3.0
 #: Least standard deviation of a vertex that the posterior assumes, as a fraction of the diagonal.
 LEAST_DEVIATION = 2e-5
 #: How a search ended, in words; with any other status than these it is _STUCK.
-_STUCK = "The search could get no nearer"
+_STUCK = "The search stalled"
 _ENDS = {
     Status.CONVERGED: "The search has converged",
-    Status.DEADLINE: "The time was over before the search was done",
-    Status.ITERATION_LIMIT: "The search ended at its largest number of shapes",
+    Status.DEADLINE: "The time ended before the search converged",
+    Status.ITERATION_LIMIT: "The search used up its number of shapes",
 }
 
 
@@ -170,8 +170,8 @@ class Encoder:
         times = _extent(vertices) / _extent(self._decoder.reference.vertices)
         if not 1 / UNITS <= times <= UNITS:
             raise InvalidMeshError(
-                f"The mesh is about {times:.3g} times as large as the training shapes: send it in the training meshes' "
-                "units."
+                f"The mesh is about {times:.3g} times as large as the training shapes. Send it in the units of the "
+                "training meshes."
             )
 
     def _posterior(self, code: Codes, shape: FloatArray, target: FloatArray, fixed: Fixed) -> Posterior:

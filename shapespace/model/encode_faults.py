@@ -132,7 +132,8 @@ def _shifted(given: FloatArray, shape: FloatArray, distances: FloatArray, edge: 
 
 def _another_order(misplaced: IntArray, count: int) -> EncodeFault:
     sentence = (
-        f"The vertices are in another order than the model's: {len(misplaced)} of {count} stand elsewhere. Export the "
+        f"The vertices are in another order than the model's: {len(misplaced)} of {count} have other positions. "
+        "Export the "
         "mesh again with the vertex order of the model, or use fit, which needs no order."
     )
     return EncodeFault(EncodeCause.ORDER, sentence, misplaced)
@@ -146,7 +147,8 @@ def _some_misplaced(misplaced: IntArray, count: int, *, exchanged: bool) -> Enco
     first = f"the first is vertex {misplaced[0]}, counted from 0"
     if exchanged:
         sentence = (
-            f"{which} are in another order than the model's: they stand where other vertices should ({first}). Export "
+            f"{which} are in another order than the model's: they are at the positions of other vertices ({first}). "
+            "Export "
             "the mesh again with the vertex order of the model."
         )
         return EncodeFault(EncodeCause.EXCHANGED, sentence, misplaced)

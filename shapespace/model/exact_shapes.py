@@ -36,8 +36,8 @@ def require_tangent_space(model: Decoder) -> tuple[FloatArray, int]:
     """Return the modes (m, V, 3) and K of a model; raises NoTangentSpaceError if it has no tangent space."""
     if model.modes is None or model.manifest.exponential_steps is None:
         raise NoTangentSpaceError(
-            f"The codes of {model.manifest.name} are no tangent vectors: it is a product by design, without exact "
-            'exponentials. Leave out "exact".'
+            f"The codes of {model.manifest.name} are not tangent vectors, so it has no exact exponentials. "
+            'Leave out "exact".'
         )
     return model.modes, model.manifest.exponential_steps
 

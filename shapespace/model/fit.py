@@ -233,7 +233,10 @@ class _Fit:
             if placement.scale > 0:
                 starts.append(StartPlacement(k, placement, float(np.linalg.norm(placement(own) - constraints.places))))
         if not starts:
-            raise InvalidScanError("All landmarks lie at one place, which tells no size. Send others, or scale=fixed.")
+            raise InvalidScanError(
+                "All landmarks lie at one place, so the size is unknown. Send landmarks at "
+                "different places, or scale=fixed."
+            )
         return sorted(starts, key=lambda start: start.score)[: effort.count]
 
     def _roughly(
@@ -378,9 +381,12 @@ class _Fit:
         shares = f"{explained:.0%} of the scan lie at the model, {seen:.0%} of the model at the scan"
         if self.ended or shape.diagnostics.status is Status.DEADLINE:
             status = FitStatus.DEADLINE
-            reason = f"The time was over before the fit was done: {shares} so far. Send fewer points or a coarser scan."
+            reason = f"The time ended before the fit converged: {shares} so far. Send fewer points or a coarser scan."
         elif self._is_poor(explained, seen):
-            status, reason = FitStatus.POOR, f"Only {shares}: the scan is no such shape, or the search went astray."
+            status, reason = (
+                FitStatus.POOR,
+                (f"Only {shares}: the scan is not a shape of this model, or the search failed."),
+            )
             if mirrored is not None and mirrored < SETTINGS.mirrored:
                 reason += " Its mirror image fits much better: change the sign of one coordinate."
             elif not self.constraints.partial:

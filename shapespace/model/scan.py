@@ -120,7 +120,7 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
             f"The faces name points {faces.min()} to {faces.max()}, but there are {len(points)}, counted from 0."
         )
     if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
-        raise InvalidScanError("The scan is so small that the numbers vanish. Send it in units of its own size.")
+        raise InvalidScanError("The scan is too small for its numbers. Send it in smaller units, such as millimetres.")
     # Strays may lie anywhere. Neither flatness nor the spacing of samples may depend on strays.
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     if not np.median(away) > 0:
@@ -130,7 +130,8 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
     spread = np.linalg.svd(_thinned(points[kept] - points[kept].mean(axis=0), rng), compute_uv=False)
     if not spread[2] > FLAT * spread[0]:
         raise InvalidScanError(
-            "All points of the scan lie in a plane, which shows nothing of a shape. Send points from all over it."
+            "All points of the scan lie in a plane, so they don't determine a shape. Send points from all of the "
+            "surface."
         )
     twice_areas = np.linalg.norm(face_normals(points, faces, normalised=False), axis=1)
     # A scan with faces at few of its points counts as a point cloud.

@@ -60,7 +60,9 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
         except OSError as error:
             raise BundleError(f"{path} can't be read: {error.strerror}") from None
         if not versions:
-            raise BundleError(f"{path} holds no bundle: give a folder NAME/VERSION, or NAME with versions in it")
+            raise BundleError(
+                f"{path} holds no bundle: name a folder NAME/VERSION, or a folder NAME with versions in it"
+            )
         path /= str(max(versions))
     return ShapeModel(read_bundle(path), threads)
 

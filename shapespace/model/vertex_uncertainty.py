@@ -59,7 +59,7 @@ def vertex_uncertainty(
             fields = reconstruct.differential(coarse, (derivatives(model, x) @ directions.T).T)
         except NotPositiveDefiniteError:
             raise InvalidCovarianceError(
-                "The shape of this code has all but collapsed: how it changes is unknown. Leave color=spread out."
+                "The shape of this code has almost collapsed, so its uncertainty is unknown. Leave color=spread out."
             ) from None
     moves = carried(model, lambda shapes: model.placed(shapes, mesh), coarse, fields)
     return scale * np.sqrt((moves**2).sum(axis=(0, 2)))

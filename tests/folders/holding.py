@@ -74,7 +74,7 @@ def hold(folder: Folder, place: Path) -> str:
     if code:
         return f"code {code}: {words.strip().splitlines()[-1][:100]}"
     # A shape with crossed faces, accepted with --accept, may fold served shapes if the run says so.
-    insists = "--accept" in folder.arguments and "where no shape has a crease" in words
+    insists = "--accept" in folder.arguments and "where no training shape has a crease" in words
     return sound(folder, place, data, may_fold=insists)
 
 

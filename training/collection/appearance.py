@@ -58,8 +58,8 @@ def kept(surface: MeshAttributes) -> str:
     if surface.textures:
         size = sum(map(len, surface.textures.values())) / 2**20
         sentence += (
-            f"; the textures {', '.join(surface.textures)} ({size:.1f} MiB) go into the bundle as they are: their "
-            "licence has to allow that, and export.licence to fit it"
+            f"; the textures {', '.join(surface.textures)} ({size:.1f} MiB) are copied into the bundle: check that "
+            "their licence allows this, and that export.licence agrees"
         )
     return sentence
 

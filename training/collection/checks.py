@@ -90,7 +90,7 @@ def mesh_arrays(vertices: np.ndarray, faces: np.ndarray, *, finite: bool = True)
     """
     if vertices.ndim == 3:
         raise MeshError(
-            f"vertices are of shape {vertices.shape}; where an NPZ holds the whole collection, name that file"
+            f"vertices are of shape {vertices.shape}; if this NPZ holds all shapes, name the file instead of its folder"
         )
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "fiu":
         raise MeshError(f"vertices must be a (V, 3) array of numbers, not {vertices.dtype} of shape {vertices.shape}")
@@ -115,7 +115,10 @@ def check_finite(vertices: np.ndarray) -> None:
 
 
 #: Exporters split vertices where normals or texture coordinates differ.
-_SPLIT = "; vertices split by flat shading or seams of texture do no harm, if all files have their faces in one order"
+_SPLIT = (
+    "; vertices that are split at texture seams or by flat shading do no harm if all files have the same faces "
+    "in the same order"
+)
 
 
 def same_connectivity(
@@ -174,8 +177,8 @@ def check_different(path: Path, vertices: FloatArray) -> None:
         raise IngestError(
             Fault(
                 str(path),
-                f"all {len(vertices)} shapes are equal up to where they stand and how they are turned",
-                "export each shape as a mesh of its own, since animations inside a file are not read",
+                f"all {len(vertices)} shapes are the same, apart from position and rotation",
+                "export each shape as a separate mesh, because animations inside a file are not read",
             )
         )
 
@@ -198,6 +201,7 @@ def orientation_notes(sources: Sequence[ShapeSource], vertices: FloatArray, face
     outwards, inwards = ([k for k, side in enumerate(sides) if side == sign] for sign in (1, -1))
     if outwards and inwards:
         odd, most = sorted((outwards, inwards), key=len)
-        what = f"is inside out, compared with {sources[most[0]].label} and most others, like a mirror image"
+        what = f"is inside out, like a mirror image, compared with {sources[most[0]].label} and most others"
         raise IngestError(*(Fault(sources[k].label, what, "mirror it back") for k in odd))
-    return ["faces are wound inside out, normals point inwards; they stay so in all that is written"] if inwards else []
+    note = "faces are wound inside out, so normals point inwards; the model's answers have the same orientation"
+    return [note] if inwards else []

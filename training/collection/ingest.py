@@ -125,20 +125,20 @@ def _welding_notes(
     notes = []
     if coincidences.apart:
         notes.append(
-            f"{coincidences.apart} pairs of vertices coincide in {files.sources[0].label} but not in every shape: they "
-            "stay apart"
+            f"{coincidences.apart} pairs of vertices coincide in {files.sources[0].label} but not in every shape, so "
+            "they are not merged"
         )
     if total > used:
-        notes.append(f"dropped {total - used} vertices that belong to no face")
+        notes.append(f"left out {total - used} vertices that belong to no face")
     if used > kept:
-        notes.append(f"welded {used} vertices into {kept}: the others coincide with these in every shape")
+        notes.append(f"merged {used} vertices into {kept}, because the others coincide with these in every shape")
     return notes
 
 
 def _seam_notes(seams: IntArray) -> list[str]:
     note = (
-        f"{len(seams)} pairs of border vertices almost coincide in every shape, to {TOLERANCES.seam:g} of the size, "
-        "and the surface stays open there: merge them in all meshes if it is meant to be closed"
+        f"{len(seams)} pairs of border vertices almost coincide in every shape, to {TOLERANCES.seam:g} of the size. "
+        "The surface stays open there: if it should be closed, merge these vertices in all meshes"
     )
     return [note] if len(seams) else []
 

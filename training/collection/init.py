@@ -17,48 +17,48 @@ from shapespace.training.runs.network_settings import CombinerSettings, LatentNe
 from shapespace.training.runs.settings import CollectionSettings, MaterialSettings, ModeSettings, SampleSettings
 
 TEMPLATE = """\
-# {title}: {shapes} shapes of {vertices} vertices and {faces} faces.
-# A line such as "# seed = 0" shows a default: take its # away to change it.
+# {title}: {shapes} shapes with {vertices} vertices and {faces} faces.
+# A line such as "# seed = 0" shows a default. To change it, remove the # and edit the value.
 
 [collection]
 data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; relative to this file
-{file}# The shape whose area becomes 1 inside, and where served shapes stand: the most central one, {reference},
-# unless another is named here, as in: reference = {other}
+{file}# Served shapes have the position and orientation of the reference. By default it is {reference}, the most central
+# shape. To choose another shape: reference = {other}
 {coarse}{parts}
-# mirror = true    # where a shape is symmetric, mirror images of all are learned from as well
+# mirror = true    # if one shape is symmetric, learn from the mirror images of all shapes too
 
 [material]
-# eta = {material.eta:g}    # bending against stretching; larger makes stiffer shells, whose triangles may collapse
+# eta = {material.eta:g}    # resistance to bending against stretching; with large values, triangles may collapse
 
 [modes]
-# count = "{mode.count}"    # how many numbers describe a shape: "auto" stops when more gain little; {most} at most
-# norm = "{mode.norm}"    # measures how near modes come to the shapes; "shell", the paper's, is less accurate
+# count = "{mode.count}"    # how many numbers describe a shape, at most {most}; "auto" stops when more help little
+# norm = "{mode.norm}"    # how errors of modes are measured; "shell", as in the paper, gives larger vertex errors
 
 [factors]
-# count = 4    # groups of modes with a network each; left out, it follows from how much the modes overlap
+# count = 4    # groups of modes, each with its own network; by default chosen from the overlap of the modes
 
 [samples]
-# count = {sample.count}    # shapes computed to learn from, most of a run's time; a tenth does for a first try
-# seed = {sample.seed}    # another number draws others
+# count = {sample.count}    # shapes to compute and learn from, most of a run's time; a tenth is enough for a first try
+# seed = {sample.seed}    # another number draws other random shapes
 
 [networks.factors]
-# hidden = {factor.hidden}    # layers of each factor's network; wider where the report shows a low R² of factors
+# hidden = {factor.hidden}    # layers of each factor's network; make them wider if the report shows a low R² of factors
 
 [networks.combiner]
-# correction = {{ kind = "{combiner.correction.kind}" }}    # how the factors join; or "kernel", "convolutions", …
+# correction = {{ kind = "{combiner.correction.kind}" }}    # how the factors are joined; or "kernel", "convolutions", …
 
 [export]
-name = {name}    # in addresses and file names: small letters, digits and hyphens
-title = {title}    # what people see
+name = {name}    # used in addresses and file names: small letters, digits and hyphens
+title = {title}    # shown to people
 description = {description}
-licence = "unspecified"    # of the meshes, and so of the model: say it before you pass the bundle on
+licence = "unspecified"    # licence of the meshes, and so of the model: fill it in before you share the bundle
 """
 
 
 #: What a configuration says where not all parts can be kept.
 _PARTS_ALONE = (
-    "# Not all parts can be kept, so this is the largest alone; of equally large ones, the first in the file.",
-    "# Name another for a model of it, or several: up to a hundred parts that are small or rigid can be attached.",
+    "# The model can't keep all parts, so it keeps only the largest; of equally large parts, the first in the file.",
+    "# You may name another part, or several: up to a hundred parts that are small or rigid can be attached.",
 )
 
 
@@ -79,7 +79,7 @@ def configuration(
     coarse = (
         f"coarse_vertices = {target}    # vertices to compute with; more take longer, 0 takes all {vertices}"
         if vertices > target
-        else f"# coarse_vertices = {target}    # vertices to compute with, where there are more than that"
+        else f"# coarse_vertices = {target}    # meshes with more vertices are simplified to this number"
     )
     return TEMPLATE.format(
         shapes=count,
@@ -90,7 +90,9 @@ def configuration(
         other=_string(collection.names[0]),
         coarse=coarse,
         parts=_parts(collection, parts),
-        file=f"file = {_string(file)}    # read from each folder in data, whose name the shape has\n" if file else "",
+        file=f"file = {_string(file)}    # file to read from each folder in data, which names the shape\n"
+        if file
+        else "",
         material=MaterialSettings(),
         most=count - 1,
         mode=ModeSettings(),
@@ -110,7 +112,7 @@ def _parts(collection: MeshCollection, chosen: Sequence[str]) -> str:
     kept = [collection.kept_alone] if collection.kept_alone else list(chosen)
     every = list(dict.fromkeys(part.name for part in collection.parts))
     names = ", ".join(_string(name) for name in kept or every)
-    what = "the model computes with the first; others named here are attached to it, the rest is left out"
+    what = "the model predicts the first part and attaches the others named here; all other parts are left out"
     lines = [f"{'' if kept else '# '}parts = [{names}]    # {what}", *_PARTS_ALONE[: 2 * bool(collection.kept_alone)]]
     lines.append("# All parts, with their shares of the area:")
     quoted = [_string(size.own) for size in collection.part_sizes]
@@ -141,7 +143,7 @@ def write(
     title = (full.stem if full.is_file() else full.name) or "shapes"
     out = out or Path(f"{title}.toml")
     if out.exists() and not force:
-        raise ConfigError(f"{out}: is there already; --force replaces it, --out FILE.toml writes another")
+        raise ConfigError(f"{out}: exists already; --force replaces it, --out FILE.toml writes another file")
     collection = read_collection(meshes, parts, file, alone=True)
     data = Path(os.path.relpath(full, out.parent.resolve())).as_posix()
     try:
@@ -150,7 +152,7 @@ def write(
         raise ConfigError(f"{out}: can't be written: {in_words(error, named=False)}") from error
     except UnicodeEncodeError as error:
         raise ConfigError(
-            f"{out}: can't be written: a name in it is no text; rename the folder or its files"
+            f"{out}: can't be written: a name in it is not valid UTF-8; rename the folder or its files"
         ) from error
     return out, collection
 

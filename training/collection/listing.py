@@ -87,14 +87,14 @@ def mesh_files(folder: Path, file: str | None = None) -> MeshFiles:
     # Python has surrogates for bytes that are no text.
     unnamed = [each.label for each in found.sources if re.search("[\ud800-\udfff]", each.label)]
     if unnamed:
-        raise IngestError(*(Fault(path, "its name is no text in UTF-8", "rename it") for path in unnamed))
+        raise IngestError(*(Fault(path, "its name is not valid UTF-8", "rename it") for path in unnamed))
     if len(found.paths) < MIN_SHAPES:
         if hint := "" if file else _nested(folder):
             raise IngestError(Fault(str(folder), f"has {len(found.paths) or 'no'} meshes, but its folders have", hint))
         if not found.paths:
             raise IngestError(_nothing(folder, file))
         npz = not file and extension(found.paths[0]) == "npz"
-        hints = ["where an NPZ holds the whole collection, name that file, not its folder"] if npz else []
+        hints = ["if one NPZ holds all shapes, name that file, not its folder"] if npz else []
         sentence = "; ".join([TOO_FEW.format(len(found.paths)), *hints, *found.left_out])
         raise IngestError(Fault.of(str(folder), sentence))
     return found
@@ -123,7 +123,7 @@ def _flat(folder: Path) -> MeshFiles:
         _left_out("their formats are not read", [path.name for path in others]),
         _left_out("their names begin with a dot", [path.name for path in every if path.name.startswith(".")]),
         _left_out(
-            "they are folders, whose files are read only with --file",
+            "they are folders; --file reads one file from each",
             [f"{path.name}/" for path in every if path.is_dir() and not path.name.startswith(".")],
         ),
     )
@@ -175,7 +175,7 @@ def _files_of_subjects(folder: Path, file: str) -> dict[str, list[Path]]:
     """Return the files of each subject that have a name or match a pattern; raises IngestError for other paths."""
     if PurePosixPath(file).is_absolute() or ".." in PurePosixPath(file).parts or not PurePosixPath(file).name:
         raise IngestError(
-            Fault(str(folder), f"{file!r} is no path within a folder", "name the file that each folder has")
+            Fault(str(folder), f"{file!r} is not a path within a folder", "name the file that each folder has")
         )
     if extension(Path(file)) not in READ_FORMATS:
         raise IngestError(
@@ -201,8 +201,8 @@ def _nested(folder: Path) -> str:
         return ""
     file, count = max(names.items(), key=lambda item: (item[1], "*" not in item[0]))
     return (
-        f"read one file from each folder, as by init {shlex.quote(str(folder))} --file {shlex.quote(file)} ({count} "
-        "folders have it), or by file in [collection] of a configuration"
+        f"read one file from each folder: init {shlex.quote(str(folder))} --file {shlex.quote(file)} ({count} "
+        "folders have it), or set file in [collection] of the configuration"
     )
 
 

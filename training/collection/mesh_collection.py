@@ -61,9 +61,9 @@ class MeshCollection:
         grave = [warning for warning in self.warnings if warning.grave and self.names[warning.shape] not in names]
         if grave:
             files = " ".join(shlex.quote(self.names[warning.shape]) for warning in grave)
-            sentences = "\n  ".join(["these shapes would spoil the model:", *(warning.sentence for warning in grave)])
-            remedy = f"\nMend or remove them; or take them as they are, with --accept {files}"
-            raise IngestError(Fault("", sentences + remedy))
+            lines = ["these shapes would make the model worse:", *(warning.sentence for warning in grave)]
+            remedy = f"\nCorrect or remove them, or use them as they are with --accept {files}"
+            raise IngestError(Fault("", "\n  ".join(lines) + remedy))
 
     def grave_faults(self) -> list[Fault]:
         """Return the grave warnings as faults."""
@@ -72,7 +72,7 @@ class MeshCollection:
             if warning.grave:
                 place, _, sentence = warning.sentence.partition(": ")
                 fault = Fault.of(place, sentence, "correct it")
-                accept = f"or take it with run --accept {shlex.quote(self.names[warning.shape])}"
+                accept = f"or use it as it is with run --accept {shlex.quote(self.names[warning.shape])}"
                 found.append(fault._replace(remedy=f"{fault.remedy} ({accept})"))
         return found
 

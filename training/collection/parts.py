@@ -113,8 +113,9 @@ def select_parts(
             reason = str(error)
             if not wanted and (touching := _seams_between(apart, shapes, seams)):
                 reason = (
-                    f"has {len(apart)} parts that almost meet: {touching} pairs of vertices on their borders are less "
-                    f"than {TOLERANCES.seam:g} of the mesh's size apart; merge them in all meshes, or take them apart"
+                    f"has {len(apart)} parts that almost meet: {touching} pairs of vertices on their borders are "
+                    f"less than {TOLERANCES.seam:g} of the mesh's size apart; merge these vertices in all meshes, or "
+                    "move the parts apart"
                 )
             if wanted or not alone:
                 raise MeshError(reason) from error
@@ -128,13 +129,13 @@ def select_parts(
 def parts_note(parts: PartSelection) -> str:
     """Return a sentence on what becomes of the parts."""
     (shell, *attached), left_out = parts.kept, parts.left_out
-    sentence = f"{len(parts.sizes)} separate parts: the model computes with {_sized(shell)}"
+    sentence = f"{len(parts.sizes)} separate parts: the model predicts {_sized(shell)}"
     if attached:
         sentence += f"; attached to it: {listed([part.name for part in attached])}"
     if left_out:
         sentence += f"; left out: {listed([part.name for part in left_out])}"
     if parts.why:
-        sentence += f". Not all can be kept, as the mesh {parts.why}"
+        sentence += f". The model can't keep all parts, because the mesh {parts.why}"
     return sentence
 
 
@@ -193,23 +194,23 @@ def _choose(
     for name in wanted:
         if not any(name in (part.name, part.own) for part in parts):
             known = listed(list(dict.fromkeys(part.name for part in parts)))
-            raise MeshError(f"has no part {name!r}, as collection.parts asks for; its parts are {known}")
+            raise MeshError(f"has no part {name!r}, which collection.parts names; its parts are {known}")
     kept = [part for part in parts if not wanted or {part.name, part.own} & {*wanted}]
     shell = _largest([part for part in kept if not wanted or wanted[0] in (part.name, part.own)], areas)
     attached = [part for part in kept if part is not shell]
     if len(attached) >= LIMITS.count:
         raise MeshError(
-            f"has {len(kept)} separate parts, where {LIMITS.count} are allowed; join them in all meshes, or keep some "
-            "only, by collection.parts: init lists them all"
+            f"has {len(kept)} separate parts, but at most {LIMITS.count} are allowed; join them in all meshes, or "
+            "name the parts to keep in collection.parts (init lists them all)"
         )
     for part in attached:
         share = areas[part.own] / areas[shell.own]
         if share > LIMITS.area and not _keeps_its_form(shapes.vertices, np.unique(shapes.faces[part.faces])):
             raise MeshError(
-                f"has {len(kept)} separate parts, of which {_sized(part)} is too large to be attached to "
-                f"{_sized(shell)}: it has {share:.0%} of the area and changes its form, and lengths and angles don't "
-                'see how two surfaces lie to each other; train one model each, as by collection.parts = ["NAME"], or '
-                "join them in all meshes"
+                f"has {len(kept)} separate parts, and {_sized(part)} is too large to be attached to {_sized(shell)}: "
+                "it "
+                f"has {share:.0%} of the area and changes its shape; train one model for each, with "
+                'collection.parts = ["NAME"], or join them in all meshes'
             )
     return [shell, *attached]
 

@@ -74,7 +74,9 @@ def read_shapes(path: Path, file: str | None = None) -> FileShapes:
         return _read_morphs(only) if only else _read_folder(path, file)
     if file:
         raise IngestError(
-            Fault(str(path), "is a file", "--file NAME is for a folder whose folders have that file each")
+            Fault(
+                str(path), "is a file", "--file NAME is for a folder with one folder per subject, each with that file"
+            )
         )
     return _read_morphs(path) if extension(path) in MORPH_FORMATS else _read_npz(path)
 
@@ -196,8 +198,8 @@ def _pose_notes(paths: Sequence[Path]) -> list[str]:
         return []
     more = f" and {len(posed) - 3} more" if len(posed) > 3 else ""
     sentence = (
-        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); one shape is read from each "
-        "file, as its sliders and joints stand there"
+        f"{', '.join(posed[:3])}{more}: with sliders (morph targets) or joints (a skin); each file gives one shape, "
+        "at the present state of its sliders and joints"
     )
     return [sentence]
 
@@ -211,7 +213,7 @@ def _unfinished(path: Path) -> str:
         last = file.read().decode(errors="replace")
     if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
         return ""
-    return "its last line has no end: if the file is cut short, copy it again"
+    return "its last line is not complete: the file may be cut short; copy it again"
 
 
 def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int, others: IntArray) -> None:
@@ -221,7 +223,7 @@ def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int,
     # The last face may have lost digits.
     if count <= other_count and len(faces) < len(others) and np.array_equal(faces[:-1], others[: len(faces) - 1]):
         what = f"it ends after {count} of {other_count} vertices and {len(faces)} of {len(others)} faces"
-        raise IngestError(Fault(str(path), f"is cut short, it seems: {what}", _unfinished(path) or "copy it again"))
+        raise IngestError(Fault(str(path), f"seems to be cut short: {what}", _unfinished(path) or "copy it again"))
 
 
 def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int, other: str) -> FloatArray:
@@ -241,7 +243,10 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
 
 def _read_npz(path: Path) -> FileShapes:
     if extension(path) != "npz":
-        what = "one file is a collection only as .npz, or as .glb or .gltf whose morph targets are the shapes"
+        what = (
+            "is one mesh; a single file can hold a collection only as .npz, or as .glb or .gltf with a morph "
+            "target for each shape"
+        )
         raise IngestError(Fault(str(path), what, "name the folder that holds the meshes"))
     with refusing(ShapeSource.of_file(path)):
         arrays = _npz_arrays(path)
@@ -293,5 +298,5 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     names = names.astype(str)
     values, counts = np.unique(names, return_counts=True)
     if (counts > 1).any():
-        raise MeshError(f"two shapes are called {values[counts.argmax()]!s}; each needs a name of its own")
+        raise MeshError(f"two shapes are called {values[counts.argmax()]!s}; give each its own name")
     return {"vertices": shapes, "faces": arrays["faces"], "names": names}

@@ -141,11 +141,13 @@ def find_warnings(
     found += _size_warnings(vertices, connectivity, edges.misplaced, scrambled)
     found += _duplicate_warnings(vertices, names)
     mirrored = [k for k in placements.mirrored() if k not in scrambled]
-    found += [CollectionWarning(k, "is a mirror image of what the others show; mirror it back") for k in mirrored]
+    found += [CollectionWarning(k, "is a mirror image of the other shapes; mirror it back") for k in mirrored]
     for k, exchange in placements.turned().items():
         if k not in scrambled and k not in mirrored:
             axes = ", ".join(f"{'−' if row.min() < 0 else ''}{'xyz'[np.abs(row).argmax()]}" for row in exchange)
-            sentence = f"is turned against the others: its x, y, z are their {axes}; is another axis up in that file?"
+            sentence = (
+                f"is rotated: its axes x, y, z are the axes {axes} of the others; check which axis is up in that file"
+            )
             found.append(CollectionWarning(k, sentence))
     return sorted(found, key=lambda warning: (warning.shape, not warning.grave))
 
@@ -166,7 +168,7 @@ def _size_warnings(
         ratio = areas[k] / np.median(areas[ordered])
         if not 1 / THRESHOLDS.area_factor < ratio < THRESHOLDS.area_factor:
             length = float(f"{ratio**0.5:.3g}")
-            sentence = f"is of another size: its lengths are {length:,g} times the median's; is it in another unit?"
+            sentence = f"has another size: its lengths are {length:,g} times the median of all shapes; check its unit"
             found.append(CollectionWarning(k, sentence, grave=True))
     return found
 
@@ -177,7 +179,7 @@ def _duplicate_warnings(vertices: FloatArray, names: Sequence[str]) -> list[Coll
     for k, shape in enumerate(vertices):
         same = first.setdefault(hashlib.sha256(shape.tobytes()).digest(), k)
         if same != k:
-            found.append(CollectionWarning(k, f"has every vertex where {names[same]} has it: the same shape twice"))
+            found.append(CollectionWarning(k, f"is the same shape as {names[same]}; remove one of them"))
     return found
 
 
@@ -213,7 +215,9 @@ class _EdgeLengths:
 
     def warnings(self) -> list[CollectionWarning]:
         """Warn of vertices in another order, wholly or in part, and of vertices far off."""
-        sentence = "has its vertices in another order than the others, with the same faces; export it again like them"
+        sentence = (
+            "has its vertices in another order than the others, with the same faces; export it again like the others"
+        )
         found = [CollectionWarning(k, sentence, grave=True) for k in self.scrambled.tolist()]
         for k, indices in self.misplaced.items():
             if k in self.scrambled:
@@ -221,12 +225,14 @@ class _EdgeLengths:
             vertex, more = int(indices[0]), f" and {len(indices) - 1} more" if len(indices) > 1 else ""
             if self._exchanged(k, indices):
                 sentence = (
-                    f"has some vertices in another order than the others, with the same faces: vertex {{vertex}}{more} "
-                    "stand where others should; export it like the others"
+                    f"has some vertices in another order than the others, with the same faces: vertex "
+                    f"{{vertex}}{more} are at the positions of other vertices; export it again like the others"
                 )
                 found.append(CollectionWarning(k, sentence, grave=True, vertex=vertex))
             else:
-                found.append(CollectionWarning(k, f"has a vertex far off: {{vertex}}{more}", vertex=vertex))
+                found.append(
+                    CollectionWarning(k, f"has a vertex far off the surface: {{vertex}}{more}; check it", vertex=vertex)
+                )
         return found
 
     def _exchanged(self, k: int, misplaced: IntArray) -> bool:

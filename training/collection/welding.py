@@ -96,7 +96,7 @@ def weld(shapes: NumberedShapes, first: IntArray) -> NumberedShapes:
     thin = np.flatnonzero((faces == np.roll(faces, 1, axis=1)).any(axis=1))
     if len(thin):
         raise PlaceError(
-            "face {face} is degenerate: in every shape two of its vertices coincide (to "
+            "face {face} has no area: in every shape two of its vertices coincide (to "
             f"{TOLERANCES.weld:g} of the mesh's size); collapse that edge in all meshes",
             {"face": [int(thin[0])]},
         )

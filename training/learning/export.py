@@ -133,13 +133,17 @@ def export(
     measured = difference(composite, networks, latents, WeightedNorm.of(reference, config.evaluation.eta))
     if not measured <= settings.tolerance:
         raise ExportError(
-            f"ONNX and PyTorch differ by {measured:.1e} in the weighted norm, over {settings.tolerance:.0e}"
+            f"the ONNX networks differ from PyTorch by {measured:.1e} in the weighted norm, but export.tolerance "
+            f"allows {settings.tolerance:.0e}"
         )
     if start and networks.start:
         answer = _answer(networks.start, START, latents.numpy())
         distance = float(np.abs(answer - predict(start, latents, 8).numpy()).max())
         if not distance <= settings.tolerance * reference.diagonal:
-            raise ExportError(f"start.onnx and PyTorch differ by {distance:.1e}, over {settings.tolerance:.0e}")
+            raise ExportError(
+                f"start.onnx differs from PyTorch by {distance:.1e}, but export.tolerance allows "
+                f"{settings.tolerance:.0e}"
+            )
 
     coordinates, material = collection.coordinates, config.material
     facts = Facts(

@@ -34,7 +34,7 @@ def shape_pictures(record: Record, studio: Studio) -> Iterator[tuple[Markup, str
     """Draw the mean and the reference, which may have two resolutions, each with a caption."""
     reference, faces = record.reference["vertices"], record.reference["faces"]
     if record.mean is not None:
-        yield studio.draw(studio.base, "The mean shape", LARGE), "mean of the collection"
+        yield studio.draw(studio.base, "The mean shape", LARGE), "mean of your shapes"
     aligned = align(reference, studio.base)
     if "fine_vertices" in record.reference:
         # The motion of the coarse reference, found as an affine map, also moves the fine reference.
@@ -42,11 +42,11 @@ def shape_pictures(record: Record, studio: Studio) -> Iterator[tuple[Markup, str
         fine, fine_faces = record.reference["fine_vertices"], record.reference["fine_faces"]
         moved = np.c_[fine, np.ones(len(fine))] @ motion
         picture = studio.draw(moved, "The reference mesh", LARGE, faces=fine_faces)
-        yield picture, f"reference as it came, {len(fine):,} vertices"
+        yield picture, f"fine reference mesh, {len(fine):,} vertices"
     elif record.mean is None:
         yield studio.draw(aligned, "The reference mesh", LARGE), "reference"
     picture = studio.draw(aligned, "The reference mesh, its triangles visible", LARGE, smooth=False)
-    yield picture, f"reference to compute with, {len(reference):,} vertices and {len(faces):,} faces"
+    yield picture, f"coarse reference mesh, {len(reference):,} vertices and {len(faces):,} faces"
 
 
 def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
@@ -66,7 +66,8 @@ def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
                 colours = tint(ramp(factor.hue if factor and kind == "SPGA" else NEUTRAL), support[kind][i])
                 local = modes.get(f"{prefix}localisation")
                 caption = kind if local is None else f"{kind} · {local[i]:.2f}"
-                pictures.append((studio.draw(moved, f"{title} of {kind} by its support", SMALL, colours), caption))
+                alt = f"{title} of {kind}, coloured where it changes the shape"
+                pictures.append((studio.draw(moved, alt, SMALL, colours), caption))
         yield {"title": title, "factor": factor, "pictures": pictures}
 
 
@@ -78,7 +79,7 @@ def factor_cards(record: Record, studio: Studio | None) -> Iterator[dict[str, An
         support = np.array([each[factor.modes].max(axis=0, initial=0) for factor in record.factors])
         for j, factor in enumerate(record.factors):
             colours = tint(ramp(factor.hue), support[j])
-            pictures[j] = studio.draw(studio.base, f"Support of {factor.name}", SMALL, colours)
+            pictures[j] = studio.draw(studio.base, f"Where {factor.name} changes the shape", SMALL, colours)
         share, strength = support**4 / (support**4).sum(axis=0).clip(1e-300), support.max(axis=0)[:, None]
         mixed = share.T @ np.array([to_rgb(factor.hue) for factor in record.factors])
         colours = (1 - strength) * to_rgb(CLAY) + strength * mixed
@@ -102,7 +103,7 @@ def extreme_shapes(record: Record, studio: Studio) -> dict[str, Any] | None:
         exact = align(gallery["test_exact"][k], studio.base)
         colours = tint(ERROR, 1 + np.log10(error[k].clip(1e-300) / top) / 2)
         predicted = align(gallery["test_predicted"][k], exact)
-        alt = f"{title} test shape as the network has it, by its error"
+        alt = f"{title} test shape of the network, coloured by its error"
         rows.append({
             "title": title,
             "number": int(gallery["test_index"][k]) if "test_index" in gallery else None,
@@ -122,9 +123,9 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
     cards = []
     if (facts := record.generalisation) and "failed" not in facts:
         cards.append({
-            "title": "Shapes it has not seen",
-            "how": f"{facts['held_out']} shapes, held out while mean and modes were found; exponentials, no networks"
-            + (f"; for {facts['stuck']} the search did not end: faces collapse" if facts.get("stuck") else ""),
+            "title": "Unseen shapes",
+            "how": f"{facts['held_out']} shapes, left out when mean and modes were found. Measured without networks"
+            + (f". The search for {facts['stuck']} shapes failed because faces collapse" if facts.get("stuck") else ""),
             "figures": [
                 (f"{count:.3g} coordinates", of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
@@ -136,9 +137,9 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
     if facts := record.encoded:
         modes = facts.get("modes")
         cards.append({
-            "title": "Shapes it has learned from",
-            "how": f"all {facts['shapes']}, through encode as it is served"
-            + (", where what it missed of them is remembered" if facts.get("remembered") else ""),
+            "title": "Training shapes",
+            "how": f"all {facts['shapes']} shapes, encoded as the server does it"
+            + (". The bundle stores corrections at these shapes" if facts.get("remembered") else ""),
             "figures": [
                 ("as served", facts, facts["components"]),
                 *([("modes alone, no networks", modes, facts["components"])] if modes else []),
@@ -154,7 +155,7 @@ def _converged(facts: dict[str, Any]) -> list[tuple[str, dict[str, float], dict[
     if not facts.get("stuck") or not facts["not_stuck"]:
         return []
     some, count = facts["not_stuck"], facts["held_out"] - facts["stuck"]
-    return [(f"where it ended ({count})", some["modes"], some["components"])]
+    return [(f"searches that ended ({count})", some["modes"], some["components"])]
 
 
 def _pair(file: NpzFile, title: str, studio: Studio | None) -> list[tuple[Markup, str]]:
@@ -184,4 +185,4 @@ def interpolation_strips(record: Record, studio: Studio) -> Iterator[tuple[str, 
         frames = align(frames, studio.base)
         moved = np.linalg.norm(frames - studio.base, axis=-1)
         colours = tint(ramp(hue), moved / max(float(moved.max()), 1e-300))
-        yield name, hue, studio.draw(frames, f"The part of {name}, frame by frame", SMALL, colours)
+        yield name, hue, studio.draw(frames, f"{name} alone, frame by frame", SMALL, colours)

@@ -104,7 +104,7 @@ def overlap_chart(record: Record) -> Markup | None:
         axes.set_yticks(range(len(names)), names, parse_math=False)
         axes.grid(visible=False)
 
-    return plot("Overlap of the factors' supports", draw, size=(3.4, 2.7))
+    return plot("Overlap of the factors", draw, size=(3.4, 2.7))
 
 
 def loss_charts(record: Record) -> Iterator[tuple[str, Markup]]:
@@ -138,4 +138,4 @@ def fraction_chart(record: Record) -> Markup | None:
         Line(at, [row["r2"][model]["total"] for row in rows], hue, model, ".-")
         for model, hue in zip(rows[0]["r2"], HUES, strict=False)
     ]
-    return lines("R² by the fraction of samples", "fraction of the samples", drawn)
+    return lines("R² by share of the samples", "share of the samples", drawn)

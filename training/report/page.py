@@ -101,8 +101,8 @@ def page(record: Record) -> str:
 def _qualities(record: Record) -> list[tuple[str, str, str]]:
     """Return rows of compactness and specificity, for modes and for components, as far as they are known."""
     rows = [
-        ("compactness", 4, "variance of your shapes that is explained (compactness)"),
-        ("specificity", 2, "from random shapes to the nearest of yours (specificity)"),
+        ("compactness", 4, "explained variance of your shapes (compactness)"),
+        ("specificity", 2, "mean distance from random shapes to the nearest of yours (specificity)"),
     ]
     found = record.evaluation
     return [
@@ -114,11 +114,11 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
 
 def _correction(correction: dict[str, Any]) -> str:
     kind, tried = correction["kind"], correction.get("tried", {})
-    sentence = f"Factors are joined by {CORRECTIONS.get(kind, kind)}"
+    sentence = f"The factors are joined by {CORRECTIONS.get(kind, kind)}"
     if kind not in tried:
         return f"{sentence}, as the configuration says."
-    sentence += f", which leaves {percent(tried[kind])} of the shapes' mean square on held-out codes"
+    sentence += f". Its error on held-out codes is {percent(tried[kind])} of the shapes' mean square"
     others = [f"{CORRECTIONS.get(each, each)} {percent(left)}" for each, left in tried.items() if each != kind]
     if others:
-        return f"{sentence}; {', '.join(others)}."
-    return f"{sentence}. Nothing else was tried, as nothing wanders over the surface or this took long."
+        return f"{sentence}. For comparison: {', '.join(others)}."
+    return f"{sentence}. No other kind was tried."

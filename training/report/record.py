@@ -59,7 +59,10 @@ class Record:
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         if not run.is_run():
-            raise ReportError(f"{run.folder} is no run directory: it holds no config.toml")
+            raise ReportError(
+                f"{run.folder} is not a run directory: it has no config.toml; name a folder that run "
+                "has written, such as runs/NAME"
+            )
         self.text = _readable(run.config.path, run.config.read)
         self.config = _readable(run.config.path, lambda: tomllib.loads(self.text))
         self.reference, self.gallery, self.modes, mean = map(_read, (run.reference, run.gallery, run.modes, run.mean))

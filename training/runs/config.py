@@ -38,9 +38,11 @@ class Config(SettingsTable):
     samples: SampleSettings = SampleSettings()
     networks: NetworkSettings = NetworkSettings()
     monolithic: LatentNetworkSettings = LatentNetworkSettings(hidden=[256, 256])
+    """The network with one factor for the whole code, trained for comparison."""
     monolithic_paper: LatentNetworkSettings = LatentNetworkSettings(
         hidden=[256, 256], fourier=0, skip_degree=0, energy=1, fit=FitSettings()
     )
+    """The paper's network with one factor, trained for comparison."""
     variants: dict[str, dict[str, Any]] = Field({})
     """Not used any more. Version 0.2 trained rows of an ablation; ``python -m benchmarks.studies`` does so now."""
     evaluation: EvaluationSettings = EvaluationSettings()
@@ -65,8 +67,8 @@ class Config(SettingsTable):
     def _usable_correction(self) -> Config:
         if self.networks.combiner.correction.kind == "field" and self.collection.generator != "freaky-torus":
             raise ValueError(
-                'networks: kind = "field" is for features that move over the surface, which only the generator '
-                "freaky-torus has"
+                'networks: kind = "field" needs features that move over the surface, which only the generator '
+                'freaky-torus has; choose "auto"'
             )
         return self
 
@@ -80,7 +82,7 @@ def parse(text: str, source: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        words = {"extra_forbidden": "there is no such setting here"}
+        words = {"extra_forbidden": "there is no such setting here; remove it or correct its spelling"}
         faults = [(".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors()]
         lines = [f"{source}: these settings can't be used", *(": ".join(filter(None, fault)) for fault in faults)]
         raise ConfigError("\n  ".join(lines)) from error
@@ -98,7 +100,7 @@ def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(
-            f"{path}: can't be read: it is no text in UTF-8; name a configuration, CONFIG.toml"
+            f"{path}: can't be read: it is not text in UTF-8; name a configuration, CONFIG.toml"
         ) from error
     except OSError as error:
         hint = "; init writes a configuration for a folder of meshes" if path.is_dir() else ""

@@ -73,8 +73,8 @@ class RunDirectory:
         # A run that was killed at its begin has left the folder of stamps and no configuration.
         if self.folder.exists() and not self.was_begun() and {path.name for path in _entries(self.folder)} - {"stages"}:
             raise NotARunError(
-                f"{self.folder} holds files and is no run directory, so nothing is written there: name an empty or a "
-                "new folder with --out"
+                f"{self.folder} holds other files and is not a run directory, so nothing was written there; name an "
+                "empty or a new folder with --out"
             )
         self._stamps.mkdir(parents=True, exist_ok=True)
 

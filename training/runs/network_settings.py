@@ -13,15 +13,15 @@ Neighbourhood = Literal["star", "flaps"]
 
 
 class FitSettings(SettingsTable):
-    """Gradient descent."""
+    """How a network is trained by gradient descent."""
 
     optimiser: Literal["adam", "muon"] = "adam"
-    """``adam``, as in the paper; or ``muon``, which updates matrices by their orthogonalised momentum and all else as
-    Adam does. It needs fewer steps of large batches."""
+    """``adam``, as in the paper, or ``muon``. Muon updates matrices by their orthogonalised momentum and all else as
+    Adam does. With large batches it needs fewer steps."""
     schedule: Literal["plateau", "cosine"] = "plateau"
     """Schedule of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for
     ``patience`` epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after
-    ``max_epochs``: fewer epochs are needed."""
+    ``max_epochs``. It needs fewer epochs."""
     learning_rate: float = Field(1e-3, gt=0)
     """Initial learning rate."""
     final_rate: float = Field(1e-6, gt=0)
@@ -33,35 +33,35 @@ class FitSettings(SettingsTable):
     batch_size: int = Field(64, ge=2)
     """Number of samples per step."""
     minutes: float | None = Field(None, gt=0)
-    """Most minutes of training. The time of the first epoch tells how many epochs fit."""
+    """Most minutes of training. The time of the first epoch decides how many epochs fit."""
 
 
 class LatentNetworkSettings(SettingsTable):
-    """A network from latents to NRIC: a factor network, or a baseline on all latents.
+    """A network from latent codes to NRIC: a factor network, or a baseline on the whole code.
 
-    The baselines are ``monolithic``, this network with one factor, and ``monolithic_paper``, the paper's.
+    The baseline ``monolithic`` is this network with one factor. ``monolithic_paper`` is the paper's monolithic network.
     """
 
     hidden: list[int] = Field([128, 128])
     """Width of each hidden layer."""
     fourier: int = Field(1, ge=0)
-    """Highest frequency of a periodic coordinate among the inputs; 0 takes the angle itself, as the paper does."""
+    """Highest frequency of a periodic coordinate among the inputs. 0 takes the angle itself, as the paper does."""
     skip_orders: list[int] = Field([])
-    """Largest frequency of each coordinate in a linear layer of Fourier products beside the hidden ones, fitted by
-    ridge regression; an empty list leaves it out. All coordinates must be periodic."""
+    """Largest frequency of each coordinate in a linear layer of Fourier products, beside the hidden layers and fitted
+    by ridge regression. An empty list leaves the layer out. All coordinates must be periodic."""
     skip_degree: int = Field(3, ge=0)
-    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate; 0 leaves it out.
-    The degree is lower for a factor that would have more than 20,000 polynomials."""
+    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate. 0 leaves the layer
+    out. The degree is lower for a factor that would have more than 20,000 polynomials."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
-    """Share of the variance that this basis keeps; 1 makes the last layer dense, as in the paper."""
+    """Share of the variance that this basis keeps. 1 makes the last layer dense, as in the paper."""
     support: float = Field(1, gt=0, le=1)
-    """Share of the variance on the edges that have entries in this basis. With less than 1 the network is sparse: edges
-    that vary little keep their mean. Files are smaller where the basis has a large rank."""
+    """Share of the variance on the edges that have entries in this basis. Below 1 the network is sparse: edges that
+    vary little keep their mean. This makes files smaller if the basis has a large rank."""
     integrability: float = Field(0, ge=0)
-    """Weight, in gradient descent, of errors that no surface can have: the gap between the first and the last face
-    around a vertex, to first order at the mean. The gap is scaled to the mean square of errors in any direction."""
+    """Weight, in gradient descent, of lengths and angles that fit no surface. They leave a gap between the first and
+    the last face around a vertex. The gap is linearised at the mean and scaled to the mean square error."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
     """How the network is trained."""
 
@@ -73,8 +73,9 @@ class LatentNetworkSettings(SettingsTable):
 
 
 class KernelSettings(SettingsTable):
-    """Kernel ridge regression on principal coefficients of the factors' shapes, separately for each patch of edges, in
-    a learned metric.
+    """Kernel ridge regression on principal coefficients of the factors' shapes, with a learned metric.
+
+    Each patch of edges has a regression of its own.
     """
 
     kind: Literal["kernel"] = "kernel"
@@ -101,18 +102,18 @@ class ConvolutionSettings(SettingsTable):
     width: int = Field(24, ge=1)
     """Number of features of each edge after each layer."""
     neighbourhood: Neighbourhood = "star"
-    """The inputs of a convolution beside an edge itself. ``star``, as in the paper, takes the sum over all edges at its
-    ends; ``flaps`` takes the edges of its two faces, each with weights of its own."""
+    """The inputs of a convolution, in addition to the edge itself. ``star``, as in the paper, takes the sum over all
+    edges at its ends. ``flaps`` takes the edges of its two faces, each with weights of its own."""
     crop: int = Field(0, ge=0)
     """Number of edges in the loss of a training step, a connected part of each shape. The part is chosen at random in
-    proportion to the error of the affine sum there; 0 takes whole shapes. Needs the neighbourhood ``flaps``."""
+    proportion to the error of the affine sum there. 0 takes whole shapes. Needs ``neighbourhood = "flaps"``."""
     residual: bool = True
     """Whether the network learns the difference from the affine sum of the factors, and each layer the difference from
-    its input. Otherwise it learns the joint shape itself, as in the paper."""
+    its input. If not, it learns the joint shape itself, as in the paper."""
     edge_channels: int = Field(4, ge=0)
-    """Number of learned constants of each edge, inputs of the first layer beside the factors' shapes."""
+    """Number of learned constants for each edge. They are inputs of the first layer, beside the factors' shapes."""
     products: int = Field(0, ge=0)
-    """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does;
+    """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does.
     0 leaves them out. Needs ``residual``."""
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of the features that are set to zero after each layer during training."""
@@ -122,7 +123,7 @@ class ConvolutionSettings(SettingsTable):
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
         if self.crop and self.neighbourhood != "flaps":
-            raise ValueError("crop needs the neighbourhood flaps")
+            raise ValueError('crop needs neighbourhood = "flaps"')
         if self.products and not self.residual:
             raise ValueError("products need residual = true")
         return self
@@ -130,7 +131,7 @@ class ConvolutionSettings(SettingsTable):
 
 class FieldSettings(SettingsTable):
     """A perceptron at every edge, trained by gradient descent. Its inputs are the angles from this edge to the features
-    that codes move over the surface. For collections that know where their features are: Freaky Torus.
+    that codes move over the surface. The collection must know where its features are, as Freaky Torus does.
     """
 
     kind: Literal["field"] = "field"
@@ -139,11 +140,11 @@ class FieldSettings(SettingsTable):
     width: int = Field(128, ge=1)
     """Width of each layer."""
     concentrations: list[Annotated[float, Field(gt=0)]] = Field([1, 4, 16, 64])
-    """Concentrations κ of the densities exp(κ (cos r − 1)) of the angle r to a feature, inputs beside the cosine and
-    the sine of r. Narrow features need large ones."""
+    """Concentrations κ of the densities exp(κ (cos r − 1)) of the angle r to a feature. They are inputs, beside the
+    cosine and the sine of r. Narrow features need large values."""
     relative: bool = True
-    """Whether inputs are functions of the angles from an edge to features, so that the network need not learn
-    symmetries that move both; otherwise inputs are the positions of features and edges."""
+    """Whether inputs are functions of the angles from an edge to features. The network then need not learn symmetries
+    that move both. If not, inputs are the positions of features and edges."""
     edges: int = Field(128, ge=1)
     """Number of edges of each shape in the loss of a training step. Half of them are drawn in proportion to the squared
     error of the affine sum."""
@@ -156,7 +157,7 @@ class FieldSettings(SettingsTable):
 class PaperSettings(SettingsTable):
     """The paper's combiner (section 4): convolutions on stars that learn the joint shape itself, with dropout 0.1.
 
-    Adam starts with a rate of 1e-3, which is divided by ten on a plateau.
+    Adam starts with a learning rate of 1e-3 and divides it by ten on a plateau.
     """
 
     kind: Literal["paper"] = "paper"
@@ -176,15 +177,16 @@ class PaperSettings(SettingsTable):
 
 
 class AutoSettings(SettingsTable):
-    """The kind that suits the collection, by its error on held-out codes.
+    """The kind with the smallest error on held-out codes.
 
-    That is ``kernel``. Where codes move something over the surface, another kind is tried too, and chosen if its error
-    is a tenth smaller: ``field`` if the collection knows where features are, and ``convolutions`` otherwise.
+    This is ``kernel`` for most collections. If codes move something over the surface, the run tries a second kind:
+    ``field`` if the collection knows where its features are, otherwise ``convolutions``. It chooses the second kind if
+    its error is at least a tenth smaller.
     """
 
     kind: Literal["auto"] = "auto"
     minutes: float = Field(30, ge=0)
-    """Most minutes of training of the other kind. It is not tried where the kernel alone took longer."""
+    """Most minutes of training for the second kind. The run does not try it if the kernel alone took longer."""
 
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
@@ -204,7 +206,7 @@ _COMBINER_OF_0_1 = {
 
 
 class CombinerSettings(SettingsTable):
-    """The map from J factor shapes to the joint one: their affine sum, plus a correction."""
+    """The map from J factor shapes to the joint shape: their affine sum, plus a correction."""
 
     correction: CorrectionSettings = AutoSettings()
     """How the difference between the joint shape and the affine sum is learned."""
@@ -246,4 +248,4 @@ class NetworkSettings(Recipe):
     """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
     paper: bool = False
     """Whether the paper's own system is trained too, for comparison: its factor networks, convolutions on stars and
-    schedules. Takes hours on a processor."""
+    schedules. This takes hours on a processor."""

@@ -27,26 +27,27 @@ class CollectionSettings(SettingsTable):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
     generator: Literal["freaky-torus", "figure"] | None = None
-    """A built-in generator of a collection; see training/collection/generators."""
+    """Name of a built-in generator, which makes the shapes itself."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
     one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
     command's ``--data`` takes precedence."""
     file: str | None = None
-    """Name of the file to read from each folder in ``data``, for data with one folder per subject. It may be a path, as
-    ``surf/pial.ply``, and have ``*`` and ``?`` in it, as ``*_mesh.ply``. Shapes have the names of the folders."""
+    """Name of the file to read from each folder in ``data``, for data with one folder per subject. It may be a path,
+    such as ``surf/pial.ply``, and have ``*`` and ``?`` in it, as in ``*_mesh.ply``. Shapes have the names of the
+    folders."""
     reference: str | None = None
-    """Name of the mesh that is scaled to area 1 and whose position and orientation served shapes have; by default the
-    most central one."""
+    """Name of the reference mesh: it is scaled to area 1, and served shapes have its position and orientation. By
+    default it is the most central mesh."""
     parts: list[str] = []
-    """Names of the parts to keep, for meshes of several parts. The first is the shell that the model computes with; the
-    others are carried along with it. By default all are kept, and the largest is the shell. Parts have the names of the
-    file's objects, groups or materials, or ``part 1``, ``part 2`` and so on; ``run --until ingest`` prints them."""
+    """Names of the parts to keep, for meshes of several parts. The model predicts the first part and attaches the
+    others to it. By default it keeps all parts, and predicts the largest. Parts have the names of the file's objects,
+    groups or materials, or ``part 1``, ``part 2`` and so on. ``run --until ingest`` prints the names."""
     coarse_vertices: int = Field(1000, ge=0)
     """Vertices to compute with: meshes with more are simplified to about this number. 0 computes with all vertices."""
     mirror: bool = True
-    """Whether to learn from the shapes' mirror images too, if one of the shapes has exactly one plane of symmetry. That
-    shape pairs each vertex with its mirror image. So a pose of the left arm is also a pose of the right arm."""
+    """Whether to learn from the shapes' mirror images too. A pose of the left arm is then also a pose of the right arm.
+    One of the shapes must have exactly one plane of symmetry, to pair each vertex with its mirror image."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -56,41 +57,41 @@ class CollectionSettings(SettingsTable):
 
 
 class MaterialSettings(SettingsTable):
-    """Elastic parameters of the shell, at unit area of the reference; see shapespace.shell.energy.Material."""
+    """Elastic parameters of the surface, which is treated as a thin shell. The reference is scaled to area 1."""
 
     mu: float = Field(Material.mu, gt=0)
     """Lamé's μ of the membrane."""
     lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
     """Lamé's λ of the membrane."""
     eta: float = Field(Material.eta, gt=0)
-    """Weight η of bending against stretching, about the squared thickness. Larger values make stiffer shells, whose
-    triangles may collapse on the way to far shapes."""
+    """Weight η of bending against stretching, about the squared thickness. Larger values make the shell stiffer. Its
+    triangles may then collapse on the way to distant shapes."""
 
 
 class ModeSettings(SettingsTable):
-    """Sparse principal geodesic analysis of the collection at its mean."""
+    """The modes: the directions in which shapes differ from their mean, found by sparse principal geodesic analysis."""
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
     mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
-    ``shell`` is the metric of the shell space, as in the paper; it gives small wrinkles much weight. ``mixed`` is the
-    first plus a tenth of the second."""
+    ``shell`` is the metric of the shell space, as in the paper. It gives small wrinkles much weight. ``mixed`` is
+    ``vertices`` plus a tenth of ``shell``."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
     """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
     values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of
     some candidates that increases the squared error of held-out shapes by at most 3 %."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Time steps K of the discrete logarithms. In one step a mode moves every vertex along a straight line, and modes
-    add up in vertices, as blend shapes do. In many steps modes bend the surface. ``auto`` takes 16, or one if that does
-    not raise the error of held-out shapes and at most a tenth of random shapes fold."""
+    """Number K of time steps of the discrete logarithms. With one step, a mode moves every vertex along a straight
+    line, and modes add up like blend shapes. With many steps, modes bend the surface. ``auto`` takes 16. It takes one
+    if that does not raise the error of held-out shapes and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
 
 
 class FactorSettings(SettingsTable):
-    """Groups of modes whose supports overlap."""
+    """The factors: groups of modes that move the same part of the surface. Each factor has a network of its own."""
 
     count: int | None = Field(None, ge=1)
     """Number of factors J; by default it follows from how much the modes overlap."""
@@ -104,25 +105,25 @@ class SampleSettings(SettingsTable):
     count: int = Field(4000, ge=10)
     """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""
     steps: int | None = Field(None, ge=1)
-    """Time steps K of the discrete exponentials, by default the same as for the logarithms. Only with the same K are
-    they inverse to each other."""
+    """Number K of time steps of the discrete exponentials, by default the same as for the logarithms. They are inverse
+    to each other only with the same K."""
     factor_counts: list[int] | int | None = None
     """Number of samples of each factor alone: one number for all factors, or one for each. Their codes are the
-    factor's part of the joint codes, and of further codes beyond ``count``. By default 1000, or ``count`` where that
-    is less; the paper takes ``count``."""
+    factor's part of the joint codes, and of further codes beyond ``count``. By default 1000, but at most ``count``. The
+    paper takes ``count``."""
     shapes: bool = True
-    """Whether the codes of the collection's own shapes are training samples too, as few random codes lie near the
-    shapes. At most a quarter of ``count`` are taken, spread evenly over the shapes."""
+    """Whether the codes of the collection's own shapes are training samples too. Few random codes lie near these
+    shapes. Their number is at most a quarter of ``count``, spread evenly over the shapes."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples with derivatives by the code, which are learned too. One takes as long as about ten
-    samples without; next to a few hundred samples, it is worth more than these ten. By default 60, or a tenth of
-    ``count`` where that is less."""
+    """Number of joint samples with derivatives by the code, which the networks learn too. Such a sample takes as long
+    as about ten samples without. Beside a few hundred samples, it is worth more than ten others. By default 60, but at
+    most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
     """Number of samples per file. A worker computes one file at a time, and loses it if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
     """Share of the joint samples that are used for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Share of the other joint samples that are used to choose the learning rate and the best epoch."""
+    """Share of the remaining joint samples that are used to choose the learning rate and the best epoch."""
     seed: int = 0
     """Seed of the random codes and of their split."""
 
@@ -144,22 +145,22 @@ def _grid(nodes: int) -> int:
 
 
 class EvaluationSettings(SettingsTable):
-    """How the test split is measured."""
+    """How the model is measured on the test samples."""
 
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
-    """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020. This baseline may take as long as all
-    samples; 0 leaves it out."""
+    """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020, for comparison. It may take as long as
+    all samples. 0 leaves it out."""
     grid_size: int = Field(1000, ge=1)
     """Most nodes of the grid of one factor. A factor gets no grid if this leaves fewer than 3 nodes per coordinate."""
     exact_factors: int = Field(200, ge=2)
-    """Number of test codes for which the affine sum of exact factors is computed."""
+    """Number of test codes for which the affine sum of exact factor shapes is computed, for comparison."""
     reconstructions: int = Field(100, ge=1)
     """Number of test shapes whose vertices are reconstructed."""
     fresh: int = Field(100, ge=0)
     """Number of fresh codes on which every model is measured once more, at most the number of test codes. They are
-    drawn after training, with a digest of the networks as seed. 0 leaves them out."""
+    drawn after training, with a digest of the networks as seed. 0 leaves this out."""
 
 
 #: An axis of the collection's coordinates, with its direction.
@@ -172,7 +173,7 @@ class ExportSettings(SettingsTable):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
     """Name of the model in addresses and file names."""
     version: int = Field(1, ge=1, lt=10**9)
-    """The bundle is written to ``models/NAME/VERSION``, replacing one that is there."""
+    """Version of the bundle, which is written to ``models/NAME/VERSION``. A bundle with this version is replaced."""
     title: str
     """Title of the model, shown to people."""
     description: str
@@ -180,18 +181,18 @@ class ExportSettings(SettingsTable):
     licence: str
     """Licence of the meshes, and so of the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
-    """Weight η of angles against lengths when vertices are found from them (Gauss–Newton)."""
+    """Weight η of angles against lengths when Gauss–Newton finds the vertices."""
     examples: bool = True
-    """Whether the model stores the errors of modes and networks at the training shapes, and corrects them at the codes
-    of these shapes. Other codes change very little. The bundle is larger by a byte for each length and angle of each
+    """Whether the bundle stores the errors of modes and networks at the training shapes, and corrects them at the codes
+    of these shapes. Other codes change very little. The bundle grows by a byte for each length and angle of each
     shape."""
     tolerance: float = Field(1e-4, gt=0)
-    """Largest relative difference of ONNX and PyTorch, in the weighted norm."""
+    """Largest allowed relative difference between the ONNX and the PyTorch networks, in the weighted norm."""
     faces: Axis | None = None
-    """The axis along which the body looks. Then left and right in names are the body's own. By default they are the
+    """The axis along which the body looks. Left and right in names are then the body's own. By default they are the
     left and right of a viewer who has x to the right, y up and z towards the eye."""
     up: Axis = "+y"
-    """The axis that points to the body's head, where ``faces`` is given."""
+    """The axis that points to the body's head. Only used with ``faces``."""
     names: dict[str, str] = {}
     """New names of factors and coordinates, by the name in the report: ``{"upper right" = "left arm"}``. Coordinates
     follow their factor unless they are named themselves."""

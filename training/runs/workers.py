@@ -119,7 +119,8 @@ def _in_processes(
         except TerminatedWorkerError as error:
             if deaths == RETRIES:
                 raise WorkersError(
-                    "worker processes were killed again and again, perhaps for want of memory"
+                    "worker processes were killed several times, probably because memory ran out; close other "
+                    "programs, or lower collection.coarse_vertices, and give the same command again"
                 ) from error
         else:
             return
@@ -139,7 +140,9 @@ def _on_cluster(
         from distributed import CancelledError, Future, KilledWorker
         from distributed.comm.core import CommClosedError
 
-        lost = WorkersError(f"the scheduler at {scheduler} was lost; the same command continues once it is back")
+        lost = WorkersError(
+            f"the connection to the scheduler at {scheduler} was lost; start it again, then give the same command again"
+        )
         waiting, deaths = deque(range(len(items))), Counter[int]()
         flying: dict[object, tuple[int, Future]] = {}
         finished: SimpleQueue[Future] = SimpleQueue()
@@ -152,7 +155,10 @@ def _on_cluster(
             if threads:
                 seen = time.monotonic()
             elif time.monotonic() - seen > ABANDONED:
-                raise WorkersError(f"the scheduler at {scheduler} has had no worker for {ABANDONED:.0f} s")
+                raise WorkersError(
+                    f"the scheduler at {scheduler} has had no worker for {ABANDONED:.0f} s; start "
+                    "workers, then give the same command again"
+                )
             while waiting and len(flying) < AHEAD * threads:
                 k = waiting.popleft()
                 # Dask computes a task's result again if the workers that hold it die; scattered data would be lost.
@@ -177,7 +183,8 @@ def _on_cluster(
                 deaths[k] += 1
                 if deaths[k] > RETRIES:
                     raise WorkersError(
-                        f"workers of {scheduler} died again and again of the same item, for want of memory?"
+                        f"workers of {scheduler} died several times at the same samples, probably because memory ran "
+                        "out; start fewer workers on each machine"
                     ) from error
                 waiting.append(k)
                 sent = None

@@ -65,11 +65,11 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
     statuses = figures.get("vertex_error", {}).get("status", {})
     stalled, count = sum(n for status, n in statuses.items() if status != "converged"), sum(statuses.values())
     if stalled:
-        sentence = f"{stalled} of {count} test shapes were not quite found from their lengths and angles"
+        sentence = f"Gauss–Newton did not converge for {stalled} of {count} test shapes"
         warnings.append(StageWarning(sentence))
     total = figures.get("r2", {}).get("composite", {}).get("total", 1.0)
     if not total > 1 - TOLERATED_LOSS:
-        sentence = f"the networks miss much: R² {total:.2f}; a larger samples.count may help"
+        sentence = f"the networks are inaccurate: R² is {total:.2f}; a larger samples.count may help"
         warnings.append(StageWarning(sentence))
     return warnings
 

@@ -50,7 +50,7 @@ def measure_generalisation(run: Run) -> None:
 
 def _warnings(run: RunDirectory) -> list[StageWarning]:
     why = run.generalisation.read_if_written().get("failed")
-    return [StageWarning(f"how near the space comes to unseen shapes was not measured: {why}")] if why else []
+    return [StageWarning(f"the error on unseen shapes was not measured: {why}")] if why else []
 
 
 STAGE = Stage(

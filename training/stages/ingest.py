@@ -57,8 +57,8 @@ def ingest(run: Run) -> None:
         prolongation = _prolong(directory, meshes, reference, fine, vertices, exact, held)
         facts["prolongation"] = prolongation
         facts["notes"] += [
-            f"{part['name']} is carried {part['carried']}: {part['mean']:.2%} of the diagonal away on average, "
-            f"{part['max']:.2%} at most"
+            f"{part['name']} is attached and moves {part['carried']}, with an error of {part['mean']:.2%} of the "
+            f"diagonal on average, {part['max']:.2%} at most"
             for part in prolongation.get("parts", ())[1:]
         ]
     if meshes.file_vertices is not None and len(meshes.file_vertices) > len(fine.vertices):
@@ -90,7 +90,7 @@ def read_meshes(config: Config) -> MeshCollection:
     if settings.generator is not None:
         return MESHES[settings.generator]()
     if settings.data is None:
-        raise ConfigError("collection.data: say where the meshes are, here or with --data")
+        raise ConfigError("collection.data is missing: set it to the folder of the meshes, or give --data")
     return read_collection(settings.data, settings.parts, settings.file)
 
 
@@ -108,7 +108,7 @@ def _mirror_images(
         return np.empty((0, *vertices.shape[1:])), np.empty(0, dtype=int), []
     images, original_index = mirrored(vertices, found[0])
     note = (
-        f"learns from {len(images)} mirror images too, since {meshes.names[found[1]]} is symmetric; "
+        f"learns from {len(images)} mirror images too, because {meshes.names[found[1]]} is symmetric; "
         "collection.mirror = false leaves them out"
     )
     return images, original_index, [note] if len(images) else []

@@ -47,11 +47,10 @@ def _describe_failure(run: RunDirectory, found: Mean) -> str:
         number = int(np.flatnonzero(reference["file_vertices"] == number)[0])
     here, there = (face_areas(x, reference["faces"])[face] for x in (shapes["vertices"][shape], found.vertices))
     return (
-        f"the shapes have no mean: {found.reason}. Of all faces, one of {file} at its vertex "
-        f"{number + first} (counted from {first}), at ({', '.join(f'{x:.6g}' for x in position)}), is "
-        "furthest from the others' with "
-        f"{here / there if there else np.inf:.1e} of the area in the mean so far. Mend the mesh there, take this shape "
-        "out of the folder, or change coarse_vertices in the configuration so that another vertex is kept"
+        f"the shapes have no mean: {found.reason}. The face that differs most from the other shapes is in {file}, at "
+        f"its vertex {number + first} (counted from {first}), at ({', '.join(f'{x:.6g}' for x in position)}). Its "
+        f"area is {here / there if there else np.inf:.1e} times the area in the mean so far. Correct the mesh there, "
+        "remove this shape from the folder, or change collection.coarse_vertices so that another vertex is kept"
     )
 
 

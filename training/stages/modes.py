@@ -76,25 +76,31 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
     warnings = []
     linearised = names[steps == 0].tolist()
     if linearised:
-        sentence = f"linearised {len(linearised)} of {len(steps)} logarithms: {listed(linearised)}"
+        sentence = (
+            f"for {len(linearised)} of {len(steps)} shapes no geodesic was found, so a straight line replaces "
+            f"it: {listed(linearised)}"
+        )
         warnings.append(StageWarning(sentence, len(linearised) / len(steps), COARSER_MESH))
     finer = names[steps > facts["log_steps"]].tolist()
     if finer:
-        sentence = f"took twice as many steps for {len(finer)} of {len(steps)} logarithms: {listed(finer)}"
+        sentence = f"{len(finer)} of {len(steps)} logarithms needed more time steps: {listed(finer)}"
         warnings.append(StageWarning(sentence))
     if found < asked:
         why = (
             f"{len(steps)} shapes differ in {found} directions"
             if found == len(steps) - 1
-            else "the others would be zero; a smaller modes.sparsity keeps more, where it isn't 0 already"
+            else "the others would be zero; a smaller modes.sparsity keeps more, unless it is 0 already"
         )
         warnings.append(StageWarning(f"found {found} of {asked} modes, because {why}"))
     unfinished = names[np.array(facts.get("codes", ["converged"] * len(names))) != "converged"].tolist()
     if unfinished:
-        sentence = f"the codes of {len(unfinished)} of {len(names)} shapes may not be the nearest: {listed(unfinished)}"
+        sentence = (
+            f"the search for the codes of {len(unfinished)} of {len(names)} shapes did not converge: "
+            f"{listed(unfinished)}"
+        )
         warnings.append(StageWarning(sentence))
     if not facts.get("converged", True):
-        sentence = "sparse modes: the iteration ended at modes.max_iterations, before it had converged"
+        sentence = "sparse modes: the iteration did not converge within modes.max_iterations; a larger number may help"
         warnings.append(StageWarning(sentence))
     return warnings
 

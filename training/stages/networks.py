@@ -34,7 +34,9 @@ def train_networks(run: Run) -> None:
     }
     for kind, path in kinds.items():
         if (found := len(indices(path))) < FEWEST:
-            raise SamplesError(f"there are only {found} {kind}, and {FEWEST} are needed to learn from")
+            raise SamplesError(
+                f"there are only {found} {kind}, but networks need at least {FEWEST}; raise samples.count"
+            )
     learner = learner_of(run)
     learner.main()
     learner.monolithic()

@@ -44,8 +44,8 @@ def refuse_old(directory: RunDirectory) -> None:
     """Raise OldRunError for a run of version 0.1: its files and settings may have another meaning today."""
     if directory.is_of_0_1():
         raise OldRunError(
-            f"{directory.folder} is a run of version 0.1: status and report still read it, but it can't be continued "
-            "or exported; run its configuration again with another directory as --out"
+            f"{directory.folder} is a run of version 0.1, which can't be continued or exported; run its "
+            "configuration again with another folder as --out"
         )
 
 
@@ -96,9 +96,9 @@ def _discard(directory: RunDirectory, path: Path, show: Callable[[str], None]) -
         if path in results or set(path.parents) & set(results):
             stamp = directory.stamp(stage.name).read_if_written()
             directory.stamp(stage.name).write({key: value for key, value in stamp.items() if key != "seconds"})
-            show(f"{name}: damaged, so it is removed, and {stage.name} makes it again")
+            show(f"{name}: is damaged and was removed; the stage {stage.name} computes it again")
             return
-    show(f"{name}: damaged, so it is removed")
+    show(f"{name}: is damaged and was removed")
 
 
 def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, show: Callable[[str], None]) -> bool:
@@ -139,14 +139,14 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)
     if source and known and not source.exists():
-        show(f"data: {source} is not there any more; the run goes on with what ingest left")
+        show(f"data: {source} does not exist any more; the run continues with the results of ingest")
         data = known
     elif known and (changes := _changes(known, data)):
-        show(f"data: {changes}; all that follows from them is done again, from ingest on")
+        show(f"data: {changes}; all stages from ingest on run again")
     if unused := run.config.unused:
         show(
-            f"{', '.join(unused)}: not used any more; python -m benchmarks.studies, in the repository, makes these "
-            "studies of a finished run"
+            f"{', '.join(unused)}: not used any more; to make these studies of a finished run, use python -m "
+            "benchmarks.studies in the repository"
         )
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
     _forget(directory, keys, show)
@@ -161,8 +161,8 @@ def _refuse_own_data(run: Run) -> None:
     places = {source.resolve(), *source.resolve().parents} if source else set()
     if source and (results & places or source.resolve() == run.directory.folder.resolve()):
         raise NotARunError(
-            f"{source} is where the run {run.directory.folder} writes its results: name another run directory with "
-            "--out, or move the data"
+            f"the data {source} are where the run {run.directory.folder} writes its results; name another run "
+            "directory with --out, or move the data"
         )
 
 
@@ -230,7 +230,7 @@ def _forget(directory: RunDirectory, keys: dict[str, dict[str, str]], show: Call
             if not path.is_dir():
                 path.unlink(missing_ok=True)
     for name in outdated[:1]:
-        show(f"{name}: another version of shapespace computed it otherwise; it and all that follows is done again")
+        show(f"{name}: this version of shapespace computes other numbers; the stages from {name} on run again")
 
 
 def _refuse_loss(stage: str, warnings: list[StageWarning], command: str) -> None:
@@ -239,6 +239,6 @@ def _refuse_loss(stage: str, warnings: list[StageWarning], command: str) -> None
         why = "; ".join(warning.sentence for warning in grave)
         advice = "; ".join(dict.fromkeys(warning.advice for warning in grave))
         raise LostTooMuchError(
-            f"stopped after {stage}: {why}, more than a quarter, and what is learned from the rest is worth little.\n"
-            f"What may help: {advice}." + (f"\nTo go on all the same: {command}" if command else "")
+            f"stopped after {stage}: {why}. This is more than a quarter, so the model would be poor.\n"
+            f"What may help: {advice}." + (f"\nTo continue nevertheless: {command}" if command else "")
         )

@@ -47,7 +47,7 @@ def draw_samples(run: Run) -> None:
 
 def _warnings(run: RunDirectory) -> list[StageWarning]:
     grouping = run.factors.read_if_written()
-    advice = f"{COARSER_MESH}; or without the shapes farthest from the others, which make the box of codes large"
+    advice = f"{COARSER_MESH}; or leave out the shapes farthest from the others, which make the range of codes large"
     warnings = []
     kinds = {"joint": run.samples}
     kinds |= {f"{name!r}": run.factor_samples(j) for j, name in enumerate(grouping.get("names", ()))}
@@ -60,16 +60,19 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
         if shortened.any():
             which = "joint samples" if kind == "joint" else f"samples of factor {kind}"
             where = _farthest(samples["asked"], shortened, grouping) if kind == "joint" else ""
-            sentence = f"shortened {shortened.sum()} of {len(failed)} codes of {which} until they had a shape{where}"
+            sentence = (
+                f"{shortened.sum()} of {len(failed)} codes of {which} had no shape and were moved towards the "
+                f"mean until they had one{where}"
+            )
             warnings.append(StageWarning(sentence, float((shortened | failed).mean()), advice))
         if not failed.any():
             continue
         reason, _ = Counter(str(r).partition(":")[0] for r in samples["reason"][failed]).most_common(1)[0]
         if kind == "joint":
             where = _farthest(samples["latents"], failed, grouping)
-            sentence = f"failed {failed.sum()} of {len(failed)} joint samples ({reason}){where}"
+            sentence = f"{failed.sum()} of {len(failed)} joint samples failed ({reason}){where}"
         else:
-            sentence = f"failed {failed.sum()} of {len(failed)} samples of factor {kind} ({reason})"
+            sentence = f"{failed.sum()} of {len(failed)} samples of factor {kind} failed ({reason})"
         warnings.append(StageWarning(sentence, float(failed.mean()), advice))
     return warnings + _folded(run)
 
@@ -95,7 +98,8 @@ def _folded(run: RunDirectory) -> list[StageWarning]:
     for part in parts(run.samples):
         anew = folded_anew(part["nric"][:, connectivity.edge_count :], angles)
         folded, count = folded + int(anew.sum()), count + len(anew)
-    return [StageWarning(f"folded {folded} of {count} joint samples where no shape has a crease")] if folded else []
+    sentence = f"{folded} of {count} joint samples have folded faces where no training shape has a crease"
+    return [StageWarning(sentence)] if folded else []
 
 
 STAGE = Stage(

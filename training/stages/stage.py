@@ -23,7 +23,7 @@ TOLERATED_LOSS = 0.25
 LISTED_NAMES = 6
 #: What helps where logarithms or samples fail.
 COARSER_MESH = (
-    "more collection.coarse_vertices or a larger material.eta, as the usual cause are thin or folded parts of the "
+    "a larger collection.coarse_vertices or material.eta, because the usual cause is a thin or folded part of the "
     "coarse mesh"
 )
 

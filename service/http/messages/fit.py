@@ -53,7 +53,7 @@ class DistancesAnswer(BaseModel):
 class UsedAnswer(BaseModel):
     """Points that represented the scan, at most a few thousand."""
 
-    positions: list[list[float]] = Field(description="In the scan's units and frame.")
+    positions: list[list[float]] = Field(description="Positions of the points, in the scan's units and frame.")
     distances: list[float] = Field(description="Distance of each point from the model's surface, in the scan's units.")
 
 
@@ -68,7 +68,7 @@ class ShapesAnswer(BaseModel):
     """Number of shapes that the search computed."""
 
     solved: int
-    rough: int = Field(description="Shapes without Gauss–Newton, which take a third of the time.")
+    rough: int = Field(description="Number of shapes without Gauss–Newton, which take a third of the time.")
 
 
 class FitAnswer(BaseModel):
@@ -76,21 +76,21 @@ class FitAnswer(BaseModel):
 
     latent: list[float]
     covariance: list[list[float]] = Field(
-        description="m × m, of the code given the scan (Laplace); zero in fixed coordinates."
+        description="m × m covariance of the code, given the scan (Laplace approximation); zero for fixed coordinates."
     )
-    placement: PlacementAnswer = Field(description="Takes the mesh of `latent` to the scan.")
+    placement: PlacementAnswer = Field(description="The motion and scale that take the mesh of `latent` to the scan.")
     distances: BothDistances
     explained: float = Field(description="Share of the scan that lies at the model.")
     seen: float = Field(description="Share of the model's area that lies at the scan.")
     noise: float = Field(description="Standard deviation of the scan about the model, in the scan's units.")
     mirrored: float | None = Field(
-        description="Cost of the scan's mirror image as a share of the scan's own cost, where the fit is poor. "
-        "A small value means that the scan is mirrored."
+        description="Cost of the scan's mirror image as a share of the scan's own cost, if the fit is poor. A small "
+        "value means that the scan is mirrored."
     )
     status: str = Field(description="converged, ambiguous, poor, stalled, or deadline (with the best result so far).")
     reason: str = Field(description="The status in words.")
-    sampled: bool = Field(description="Whether fewer points, or points spread over the faces, represented the scan.")
+    sampled: bool = Field(description="Whether the fit used a part of the points, or points spread over the faces.")
     shapes: ShapesAnswer
     diagnostics: DiagnosticsAnswer = Field(description="Diagnostics of the code's shape.")
     samples: list[list[float]] | None = Field(None, description="With `samples`: codes drawn from the posterior.")
-    used: UsedAnswer | None = Field(None, description="With `used`: the points that represented the scan.")
+    used: UsedAnswer | None = Field(None, description="With `used`: the points that the fit used.")

@@ -64,11 +64,14 @@ class ColourParameters:
         if self.quantity is Quantity.SPREAD:
             if covariance is None:
                 raise ProblemError(
-                    "invalid-request", "color=spread shows how sure a code is. POST it with its covariance in the body."
+                    "invalid-request",
+                    "color=spread needs the covariance of the code. POST the code and its covariance in the body.",
                 )
             return ColourOptions(self.quantity, None, require_covariance(model.decoder, covariance))
         if covariance is not None:
-            raise ProblemError("invalid-request", "covariance is what color=spread shows. Add ?color=spread.")
+            raise ProblemError(
+                "invalid-request", "covariance is only for color=spread. Add ?color=spread, or leave covariance out."
+            )
         if self.quantity is None:
             return None
         return ColourOptions(self.quantity, None if self.against is None else model.latents.code(self.against, bounds))
@@ -78,23 +81,26 @@ async def _color(
     color: Annotated[
         Quantity | None,
         Query(
-            description="Colour the vertices by how their edges differ from the other shape's: `stretch` is the "
-            "logarithm of the lengths' ratio, `bending` the change of the dihedral angles in radians. Or by `spread`, "
-            "the standard deviation of each vertex by the `covariance` in the body of a POST. Every format but STL "
-            "carries colours; NPZ and JSON carry the values."
+            description="Colour the vertices by their difference from another shape: `stretch` is the logarithm of "
+            "the ratio of edge lengths, `bending` the change of the dihedral angles in radians. `spread` is the "
+            "standard deviation of each vertex, from the `covariance` in the body of a POST. Every format but STL "
+            "can have colours; NPZ and JSON have the values."
         ),
     ] = None,
     against: Annotated[
         Numbers,
         Query(
-            description="With `color`: code of the other shape, coordinates separated by commas; without it the "
-            "reference.",
+            description="With `color`: code of the other shape, its coordinates separated by commas. By default the "
+            "other shape is the reference.",
             openapi_examples={"a code": {"value": [0, 0, 0, 0]}},
         ),
     ] = None,
 ) -> ColourParameters:
     if against is not None and color in (None, Quantity.SPREAD):
-        raise ProblemError("invalid-request", "against says what colours compare with. Add color=stretch or bending.")
+        raise ProblemError(
+            "invalid-request",
+            "against is only for color=stretch and color=bending. Add one of them, or leave against out.",
+        )
     return ColourParameters(color, None if against is None else numbers(against, "against"))
 
 
@@ -104,8 +110,8 @@ NO_COLOR = ColourParameters(None, None)
 TopologyQuery = Annotated[
     Topology | None,
     Query(
-        description="`original`, the default where a format can: faces are the polygons of the files that the model is "
-        "of; OBJ (also in a zip), PLY, USD and VTK can. `triangles`: these cut at their first corner."
+        description="`original` (default of OBJ, zip, PLY, USD and VTK): faces are the polygons of the training "
+        "files. `triangles`: polygons are split into triangles from their first corner."
     ),
 ]
 
@@ -142,7 +148,9 @@ class _PlacementRequest(Body):
         matrix = np.array(self.rotation)
         largest = np.abs(matrix).max()
         if not (largest < 2 and np.abs(matrix @ matrix.T - np.eye(3)).max() < _ROUNDING and np.linalg.det(matrix) > 0):
-            raise ValueError("rotation is none: its rows must be orthogonal, of length 1, and without a reflection")
+            raise ValueError(
+                "rotation is not a rotation matrix: its rows must be orthogonal, of length 1, and without a reflection"
+            )
         return self
 
 
@@ -153,7 +161,7 @@ async def _place(
     place: Annotated[
         str | None,
         Query(
-            description="Answer the mesh elsewhere: a placement as JSON, as `edit` and `fit` answer it: it takes x to "
+            description="Move the mesh to this placement, which is JSON as `edit` and `fit` answer it. It takes x to "
             "`scale` · `rotation` · x + `translation`. Members left out change nothing.",
             openapi_examples={"a quarter turn": {"value": _EXAMPLE}},
         ),

@@ -36,7 +36,7 @@ class InputParameters(_Message):
     """Parameters of the input."""
 
     binary_data_size: SkipJsonSchema[Annotated[Whole, Field(ge=0)] | None] = Field(
-        None, description="Number of its bytes after the JSON."
+        None, description="Number of bytes of this tensor after the JSON."
     )
 
 
@@ -66,14 +66,14 @@ class InputTensor(_Message):
     datatype: Literal["FP32"]
     parameters: InputParameters = InputParameters(binary_data_size=None)
     data: _Numbers | Annotated[list[_Numbers], Field(fail_fast=True)] | SkipJsonSchema[None] = Field(
-        None, description="The numbers, flat or one list for each row; absent if bytes follow."
+        None, description="The numbers, as one list or as a list for each row; absent if bytes follow."
     )
 
 
 class OutputParameters(_Message):
     """Parameters of an output."""
 
-    binary_data: bool | None = Field(None, strict=True, description="Send it as bytes after the JSON.")
+    binary_data: bool | None = Field(None, strict=True, description="Send this output as bytes after the JSON.")
 
 
 class RequestedOutput(_Message):
@@ -87,7 +87,7 @@ class InferenceParameters(_Message):
     """Parameters of the whole request."""
 
     binary_data_output: bool = Field(
-        False, strict=True, description="Send all outputs as bytes, unless one says otherwise."
+        False, strict=True, description="Send outputs as bytes, unless an output asks for JSON."
     )
     mesh: MeshChoice = Field(
         MeshChoice.FINE, description="The mesh whose vertices are answered, if the model has a fine one."
@@ -113,7 +113,7 @@ class InferenceRequest(_Message):
     id: str | None = Field(None, description="Repeated in the answer.")
     inputs: Annotated[list[InputTensor], Field(min_length=1, max_length=1)]
     outputs: Annotated[
-        list[RequestedOutput], Field(fail_fast=True, description="Both by default; each at most once.")
+        list[RequestedOutput], Field(fail_fast=True, description="Outputs to send, each at most once; by default both.")
     ] = []
     parameters: InferenceParameters = InferenceParameters()
 
@@ -147,7 +147,7 @@ class OutputTensor(BaseModel):
     name: OutputName
     shape: list[int]
     datatype: Literal["FP32"]
-    data: list[float] | None = Field(None, description="Flat, row by row; absent if bytes follow.")
+    data: list[float] | None = Field(None, description="The numbers as one list, row by row; absent if bytes follow.")
     parameters: dict[str, int] | None = Field(None, description="`binary_data_size`, if bytes follow.")
 
 
@@ -260,7 +260,7 @@ class StatisticsAnswer(BaseModel):
 class IndexRequest(_Message):
     """Which models the index lists."""
 
-    ready: bool = Field(False, strict=True, description="Only those that are served.", examples=[True])
+    ready: bool = Field(False, strict=True, description="List only versions that are served.", examples=[True])
 
 
 class IndexedModel(BaseModel):

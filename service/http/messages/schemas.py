@@ -34,16 +34,20 @@ Latents = Annotated[
         json_schema_extra={"minItems": 1},
     ),
 ]
-MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, where the model has a finer one.")]
+MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, if the model has a fine one.")]
 QualityField = Annotated[
     Quality,
     Field(
-        description="`draft` leaves Gauss–Newton out where the first guess is near enough, in a fraction of the time; "
-        "the card's `draft_error` says how near. `Shape-Diagnostics.quality` says what was answered."
+        description="`draft` leaves out Gauss–Newton if the first guess is accurate enough, and takes about half the "
+        "time. The card's `draft_error` is the error. `Shape-Diagnostics.quality` says which quality was answered."
     ),
 ]
 BoundsField = Annotated[
-    Bounds, Field(description="Outside the bounds: extrapolate, clamp to the nearest bound, or reject.")
+    Bounds,
+    Field(
+        description="For a code outside the bounds: extrapolate (`allow`), move it to the nearest bound "
+        "(`clamp`), or refuse it (`reject`)."
+    ),
 ]
 
 
@@ -55,7 +59,7 @@ class MeshRequest(Body):
     bounds: BoundsField = Bounds.ALLOW
     quality: QualityField = Quality.FULL
     covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
-        None, description="With `?color=spread`: m × m, of codes around this one, as `edit` and `encode` answer it."
+        None, description="With `?color=spread`: m × m covariance of the code, as `edit`, `encode` and `fit` answer it."
     )
 
 
@@ -66,12 +70,12 @@ class VerticesRequest(Body):
     exact: bool = Field(
         False,
         strict=True,
-        description="Also answer the true discrete exponentials, of models with a tangent space, and their distances.",
+        description="Also answer the true discrete exponentials and their distances, for models with a tangent space.",
     )
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
     quality: QualityField = Quality.FULL
-    faces: bool = Field(True, strict=True, description="Whether NPZ has the mesh's faces too; JSON never has.")
+    faces: bool = Field(True, strict=True, description="Whether NPZ has the faces too. JSON never has them.")
 
 
 @body_of(Target)
@@ -86,7 +90,7 @@ class EditRequest(Body):
     latent: Latent
     targets: Annotated[
         list[TargetRequest], Field(fail_fast=True, min_length=1, examples=[[{"vertex": 0, "position": [0.3, 0.1, 0]}]])
-    ] = Field(description="At least one target, in the frame of the mesh that `latent` is answered with.")
+    ] = Field(description="At least one target, in the frame in which the server answers the mesh of `latent`.")
 
 
 @query_of(EncodeOptions)
@@ -103,21 +107,19 @@ class SampleRequest(Body):
     """How many random codes, and which."""
 
     count: Whole = Field(1, ge=1, description="Number of codes.", examples=[3])
-    seed: Whole = Field(0, ge=0, lt=2**63, description="The same codes for the same seed.")
+    seed: Whole = Field(0, ge=0, lt=2**63, description="Seed of the random codes. The same seed gives the same codes.")
     distribution: Distribution = Field(
         Distribution.UNIFORM,
-        description="In the bounds uniform, or gaussian: around their middle, with a standard deviation of a quarter "
-        "of their width, and cut off at them. Or the population: the Gaussian with shrinkage fitted to the codes of "
-        "the training shapes, not cut off.",
+        description="`uniform` in the bounds. `gaussian`: around the middle of the bounds, with a standard deviation "
+        "of a quarter of their width, truncated at the bounds. `population`: a Gaussian with shrinkage fitted to the "
+        "training codes, not truncated.",
     )
-    temperature: Number = Field(
-        1.0, ge=0, description="With `population`: factor of the differences from its mean. Otherwise it is 1."
-    )
+    temperature: Number = Field(1.0, ge=0, description="With `population`: multiplies the deviations from the mean.")
 
     @model_validator(mode="after")
     def _of_the_population(self) -> SampleRequest:
         if self.temperature != 1 and self.distribution is not Distribution.POPULATION:
-            raise ValueError('temperature goes with "distribution": "population"')
+            raise ValueError('temperature is only for "distribution": "population"; leave it out otherwise')
         return self
 
 
@@ -125,7 +127,7 @@ class NRICRequest(Body):
     """Several codes, and whether to answer each factor's own lengths and angles too."""
 
     latents: Latents
-    factors: bool = Field(False, strict=True, description="Also answer ψ_j of each factor j.")
+    factors: bool = Field(False, strict=True, description="Also answer the lengths and angles of each factor alone.")
     bounds: BoundsField = Bounds.ALLOW
 
 
@@ -133,7 +135,7 @@ class ColorAnswer(BaseModel):
     """How a mesh differs from another one, vertex by vertex."""
 
     quantity: Quantity
-    range: list[float] = Field(description="Values at the ends of the legend.", min_length=2, max_length=2)
+    range: list[float] = Field(description="Smallest and largest value of the legend.", min_length=2, max_length=2)
     map: str = Field(description="Name of the colour map that the other formats use.")
     values: list[float] = Field(description="V values.")
 
@@ -143,27 +145,28 @@ class MeshAnswer(BaseModel):
 
     vertices: list[list[float]] = Field(description="V positions.")
     faces: list[list[int]] = Field(description="F triples of vertex indices, from 0.")
-    color: ColorAnswer | None = Field(None, description="Only where `color` was asked for.")
+    color: ColorAnswer | None = Field(None, description="Only if the request has `color`.")
 
 
 class DiagnosticsAnswer(BaseModel):
     """How well a shape was found."""
 
     status: str = Field(description="How Gauss–Newton ended: converged, stalled, iteration_limit.")
-    iterations: int = Field(description="Its iterations.")
-    residual: float = Field(description="Relative misfit of lengths and angles in the weighted norm.")
-    flipped_faces: int = Field(description="Faces folded more than π/2 away from what the networks ask for.")
+    iterations: int = Field(description="Number of iterations of Gauss–Newton.")
+    residual: float = Field(description="Relative error of lengths and angles in the weighted norm.")
+    flipped_faces: int = Field(description="Number of faces folded more than π/2 away from the predicted angle.")
     integrability: float = Field(
-        description="How far the predicted lengths and angles are from those of any surface: root mean square over "
-        "vertices of the sine of half the angle by which the faces around it fail to close."
+        description="How far the predicted lengths and angles are from the lengths and angles of any surface. It is "
+        "the sine of half the angle by which the faces around a vertex fail to close, as root mean square over "
+        "vertices."
     )
     plausibility: float | None = Field(
-        description="Distance to the nearest training shape's code, in multiples of the distance that these typically "
-        "have from each other; null where the model was not made from shapes."
+        description="Distance to the nearest training code, in multiples of the typical distance between training "
+        "codes; null for models without training codes."
     )
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     model: str = Field(description="SHA-256 of the model's manifest.")
-    quality: Quality = Field(description="`draft` where Gauss–Newton was left out, otherwise `full`.")
+    quality: Quality = Field(description="`draft` if Gauss–Newton was left out, otherwise `full`.")
 
 
 class VertexError(BaseModel):
@@ -177,14 +180,16 @@ class VerticesAnswer(BaseModel):
     """Positions of n shapes."""
 
     vertices: list[list[list[float]]] = Field(description="n × V × 3 positions, in the units of the training meshes.")
-    diagnostics: list[DiagnosticsAnswer] = Field(description="One for each shape.")
+    diagnostics: list[DiagnosticsAnswer] = Field(description="Diagnostics of each shape.")
     exact: list[list[list[float]] | None] | None = Field(
-        None, description="With `exact`: positions of the true exponentials, null where one could not be found."
+        None, description="With `exact`: positions of the true exponentials; null for each that was not found."
     )
     distance: list[VertexError | None] | None = Field(
-        None, description="With `exact`: how far the vertices are from those, null where one could not be found."
+        None,
+        description="With `exact`: distance of the vertices from the true exponentials; null for each that was "
+        "not found.",
     )
-    exact_status: list[str] | None = Field(None, description="With `exact`: how each exponential's solver ended.")
+    exact_status: list[str] | None = Field(None, description="With `exact`: how the solver of each exponential ended.")
 
 
 class PlacementAnswer(BaseModel):
@@ -195,30 +200,36 @@ class PlacementAnswer(BaseModel):
     scale: float
 
 
-_COVARIANCE = "m × m, of codes around `latent`; zero in the rows and columns of what is fixed."
-_SAMPLED = "Random codes around `latent` of that covariance, as many as `samples`; not cut off at the bounds."
+_COVARIANCE = "m × m covariance of codes around `latent`; zero in the rows and columns of fixed coordinates."
+_SAMPLED = (
+    "With `samples`: this number of random codes around `latent` with this covariance. They may lie outside the bounds."
+)
 
 
 class EncodeAnswer(BaseModel):
     """The code of a mesh."""
 
     latent: list[float]
-    residual: float = Field(description="Relative misfit of the mesh's lengths and angles in the weighted norm.")
-    vertex_error: VertexError = Field(description="Between the mesh and the code's shape, after rigid alignment.")
-    vertex_errors: list[float] = Field(description="The same vertex by vertex.")
+    residual: float = Field(description="Relative error of the mesh's lengths and angles in the weighted norm.")
+    vertex_error: VertexError = Field(
+        description="Distance between the mesh and the shape of the code, after rigid alignment."
+    )
+    vertex_errors: list[float] = Field(description="The same distance for each vertex.")
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     status: str = Field(
         description="How the search ended: converged, stalled, iteration_limit, deadline (with the best result so "
-        "far), or poor: the mesh is no shape of the model, so do not use the code."
+        "far), or poor: the mesh is not a shape of the model, so do not use the code."
     )
     reason: str = Field(description="The status in words.")
     cause: EncodeCause | None = Field(
-        description="With `poor`: all vertices have another `order`, some are `exchanged` or are `outliers` far off, "
-        "or the mesh is `mirrored`. Otherwise null."
+        description="With `poor`: all vertices have another `order`, some vertices are `exchanged` or far off "
+        "(`outliers`), or the mesh is `mirrored`. Otherwise null."
     )
-    misplaced: list[int] = Field(description="Vertices that are exchanged or lie far off, from 0.")
-    iterations: int = Field(description="Shapes that it looked at; evaluations of the networks if by `nric`.")
-    mesh: MeshChoice = Field(description="Which mesh of the model was sent.")
+    misplaced: list[int] = Field(description="Indices of vertices that are exchanged or lie far off, from 0.")
+    iterations: int = Field(
+        description="Number of shapes that the search computed; with `nric`, number of evaluations of the networks."
+    )
+    mesh: MeshChoice = Field(description="Whether the request had the fine or the coarse mesh.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
     covariance: list[list[float]] = Field(description=_COVARIANCE)
     samples: list[list[float]] = Field(description=_SAMPLED)
@@ -229,19 +240,20 @@ class EditAnswer(BaseModel):
 
     latent: list[float]
     residual: float = Field(
-        description="Root mean square distance from the targets, in the units of the training meshes, once "
-        "`placement` is applied."
+        description="Root mean square distance from the targets, in the units of the training meshes, after "
+        "`placement`."
     )
-    distances: list[float] = Field(description="Distance from each target, likewise.")
+    distances: list[float] = Field(description="Distance from each target, in the same frame.")
     placement: PlacementAnswer = Field(
-        description="Takes the mesh of the new code into the frame of that of the old one; `scale` is 1."
+        description="The motion that takes the mesh of the new code into the frame of the mesh of the old code; "
+        "`scale` is 1."
     )
     covariance: list[list[float]] = Field(description=_COVARIANCE)
     samples: list[list[float]] = Field(description=_SAMPLED)
     status: str = Field(
         description="How the search ended: converged, stalled, iteration_limit, deadline (with the best result so far)."
     )
-    iterations: int = Field(description="Shapes that it looked at.")
+    iterations: int = Field(description="Number of shapes that the search computed.")
     diagnostics: DiagnosticsAnswer = Field(description="Of the code's shape.")
 
 
@@ -257,7 +269,7 @@ class NRICAnswer(BaseModel):
     lengths: list[list[float]] = Field(description="n × E edge lengths, in the units of the training meshes.")
     angles: list[list[float]] = Field(description="n × E signed dihedral angles in radians, positive where convex.")
     factors: list[list[list[float]]] | None = Field(
-        None, description="n × J × 2E: lengths, then angles, of each factor on its own."
+        None, description="n × J × 2E: lengths, then angles, of each factor alone."
     )
 
 
@@ -287,8 +299,8 @@ class ModelSummary(BaseModel):
     edges: int
     faces: int
     surface: AttributesEntry | None = Field(
-        description="What answers of the fine mesh have from the training files beside triangles: names of parts, "
-        "materials, textures, and whether these had normals; null where nothing."
+        description="What answers of the fine mesh keep from the training files: names of parts, materials, "
+        "textures, and whether the files had normals. Null if there is nothing but triangles."
     )
     links: dict[str, str] = Field(description="Addresses of the model's calls.")
 
@@ -310,8 +322,8 @@ class GeneralisationAnswer(DistanceAnswer):
     """Distance of vertices of shapes that were held out, beside as many principal components of aligned vertices."""
 
     components: DistanceAnswer
-    shapes: int = Field(description="How many were held out.")
-    modes: float = Field(description="How many modes; a mean where several folds differ.")
+    shapes: int = Field(description="Number of unseen shapes.")
+    modes: float = Field(description="Number of modes; a mean if the folds differ.")
 
 
 class BesideComponents(BaseModel):
@@ -336,17 +348,17 @@ class ModelCard(ModelSummary):
     onnx_tolerance: dict[str, float]
     figures: dict[str, Any] = Field(description="Evaluation figures on the test split.")
     generalisation: GeneralisationAnswer | None = Field(
-        description="How near the modes come to shapes that they were found without; null where that is not known."
+        description="Error of the modes on unseen shapes; null if it was not measured."
     )
     compactness: BesideComponents | None = Field(
-        description="Share of the variance of the training shapes that is explained; null where that is not known."
+        description="Explained share of the variance of the training shapes; null if it was not measured."
     )
     specificity: BesideComponents | None = Field(
-        description="Mean distance of random shapes from the nearest training shape, as a share of the bounding box's "
-        "diagonal; null where that is not known."
+        description="Mean distance of random shapes from the nearest training shape, as a share of the bounding "
+        "box's diagonal; null if it was not measured."
     )
     draft_error: DistanceAnswer | None = Field(
-        description="How far drafts are from full shapes over codes inside the bounds; null where that is not known."
+        description="Distance of drafts from full shapes, over codes inside the bounds; null if it was not measured."
     )
     origin: dict[str, Any]
 
@@ -355,7 +367,7 @@ class InterpolationAnswer(BaseModel):
     """A new interpolation; its id holds all of it and stays valid as long as the model is served."""
 
     id: str
-    frames: int = Field(description="Number of frames, from 0.")
+    frames: int = Field(description="Number of frames. Their indices start at 0.")
     links: dict[str, str]
 
 
@@ -369,7 +381,7 @@ class Readiness(BaseModel):
     """Open Inference Protocol: server ready."""
 
     ready: bool
-    faults: list[str] | None = Field(None, description="Sentences about default versions that can't be answered.")
+    faults: list[str] | None = Field(None, description="Sentences about default versions that are not served.")
 
 
 class Problem(BaseModel):

@@ -48,7 +48,10 @@ class LimitBody(HTTPMiddleware):
             if length > limit:
                 raise _too_large(limit)
             if encoding not in ("identity", *WINDOWS):
-                detail = "The body has a Content-Encoding that isn't read here. Send it plain, or with gzip or deflate."
+                detail = (
+                    "The body has a Content-Encoding that isn't read here. Send it uncompressed, or with gzip "
+                    "or deflate."
+                )
                 raise ProblemError("unsupported-media-type", detail)
             message = await given()
             size = len(message.get("body", b""))
@@ -57,7 +60,9 @@ class LimitBody(HTTPMiddleware):
             try:
                 self._held.take(client, size)
             except QuotaError:
-                raise ProblemError("busy", "The server holds too many bodies. Try again after Retry-After.") from None
+                raise ProblemError(
+                    "busy", "The server holds too many bodies. Try again after the time in Retry-After."
+                ) from None
             received += size
             return message
 

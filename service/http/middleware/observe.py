@@ -60,10 +60,13 @@ class Observe(HTTPMiddleware):
                 detail = "The server is about to end. Send the request to another one, or again in a moment."
                 await problem(scope, "not-ready", detail)(scope, receive, observed)
         except Exception:
-            logger.exception("a mistake of the server")
+            logger.exception("internal error")
             if answered:
                 raise  # breaks the connection, the only way left to tell the client
-            detail = "The server made a mistake, which its log describes. Try again, and report it if it happens again."
+            detail = (
+                "The server has an internal error. Try again. If it happens again, report it with the "
+                "X-Request-ID of this answer, which leads to it in the log."
+            )
             await problem(scope, "internal-error", detail)(scope, receive, observed)  # only the log has the traceback
         finally:
             seconds = time.perf_counter() - began

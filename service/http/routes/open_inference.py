@@ -43,7 +43,7 @@ router = APIRouter(prefix="/v2", tags=["inference"])
 
 _DEFAULT, _VERSION = "/models/{name}", "/models/{name}/versions/{version}"
 EXTENSIONS = ["binary_tensor_data", "model_configuration", "model_repository", "statistics"]
-_REFUSED = "The bundle is refused; the log of the server names the fault."
+_REFUSED = "The bundle was refused. The log of the server names the fault."
 _INDEX_REQUEST = {"$ref": f"#/components/schemas/{IndexRequest.__name__}"}
 _BYTES = {OCTET_STREAM: {"schema": {"type": "string", "format": "binary"}}}
 _REQUEST = {"$ref": f"#/components/schemas/{InferenceRequest.__name__}"}

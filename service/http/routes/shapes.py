@@ -55,7 +55,9 @@ async def get_mesh(
             openapi_examples={"a code": {"value": [1, 2, 3, 4]}},
         ),
     ] = None,
-    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
+    mesh: Annotated[
+        MeshChoice, Query(description="Which mesh to answer, if the model has a fine one.")
+    ] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     quality: QualityQuery = Quality.FULL,
 ) -> Response:
@@ -97,7 +99,9 @@ async def post_vertices(
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
     mesh: MeshQuery = None,
     quality: QualityOfBody = None,
-    exact: Annotated[bool, Query(description="As in the body: add the true discrete exponentials.")] = False,
+    exact: Annotated[
+        bool, Query(description="Also answer the true discrete exponentials, as `exact` in the body does.")
+    ] = False,
     place: PlaceQuery = None,
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
 ) -> Response:
@@ -149,7 +153,9 @@ async def get_blend_shapes(
     request: Request,
     caller: CallerDependency,
     model: Model,
-    mesh: Annotated[MeshChoice, Query(description="The mesh, if the model has a fine one.")] = MeshChoice.FINE,
+    mesh: Annotated[
+        MeshChoice, Query(description="Which mesh to answer, if the model has a fine one.")
+    ] = MeshChoice.FINE,
 ) -> Response:
     """The shape of code 0 with a morph target for each bound of each coordinate: sliders without this server.
 

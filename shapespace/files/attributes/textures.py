@@ -79,6 +79,6 @@ class Textures:
 
 def _too_large(size: int) -> str:
     return (
-        f"it has {size / 2**20:.1f} MiB, where {LARGEST >> 20} are the most, and {ALL >> 20} of all together; make it "
-        "smaller"
+        f"it has {size / 2**20:.1f} MiB, but at most {LARGEST >> 20} are allowed, and {ALL >> 20} for all textures; "
+        "make it smaller"
     )

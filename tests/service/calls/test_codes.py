@@ -112,7 +112,7 @@ def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
         ({"prior_kind": "lasso"}, "'groups' or 'ridge'"),
         ({"targets": [target | {"sigma": 0}]}, "targets[0].sigma"),
         ({"fixed": {"3": 0}}, "coordinates 0 to 2"),
-        ({"fixed": {"-1": 0}}, "'-1' is no index"),
+        ({"fixed": {"-1": 0}}, "'-1' is not an index"),
         ({"fixed": {"0": None}}, "the value at 0 is not a finite number"),
         ({"fixed": [0]}, "fixed"),
         ({"samples": 21}, "the limit is 20"),
@@ -154,7 +154,7 @@ def test_bad_samples_are_told_what_to_do(client: httpx.Client) -> None:
         ({"distribution": "cauchy"}, "'uniform', 'gaussian' or 'population'"),
         ({"distribution": "population", "temperature": -1}, "at least 0"),
         ({"distribution": "population", "temperature": 1e300}, "not a finite number"),
-        ({"temperature": 2}, 'goes with "distribution": "population"'),
+        ({"temperature": 2}, 'only for "distribution": "population"'),
     ):
         answer = client.post(SAMPLE, json=body)
         assert answer.status_code == 422, answer.text

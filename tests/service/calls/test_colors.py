@@ -188,10 +188,10 @@ def test_a_spread_needs_a_covariance(client: httpx.Client) -> None:
         assert answer.status_code == 422
         assert says in answer.json()["detail"]
     for answer, says in (
-        (client.get(MESH, params={"latent": text(CODE), "color": "spread"}), "POST it with its covariance"),
-        (client.post(MESH, params={"color": "spread"}, json={"latent": CODE}), "POST it with its covariance"),
+        (client.get(MESH, params={"latent": text(CODE), "color": "spread"}), "POST the code and its covariance"),
+        (client.post(MESH, params={"color": "spread"}, json={"latent": CODE}), "POST the code and its covariance"),
         (client.post(MESH, json={"latent": CODE, "covariance": np.eye(3).tolist()}), "Add ?color=spread"),
-        (client.get(MESH, params={"color": "spread", "against": text(CODE)}), "Add color=stretch"),
+        (client.get(MESH, params={"color": "spread", "against": text(CODE)}), "only for color=stretch"),
         (client.post(MESH, json={"latent": CODE, "covariance": [[1], 2]}), "covariance[1]"),
     ):
         assert answer.status_code == 422

@@ -153,7 +153,7 @@ def test_the_query_says_what_is_fixed_and_how_many_samples(client: httpx.Client)
         ({"fixed": "{"}, "fixed is not JSON"),
         ({"fixed": "[1]"}, "fixed"),
         ({"fixed": '{"3": 1}'}, "coordinates 0 to 2"),
-        ({"fixed": '{"one": 1}'}, "'one' is no index"),
+        ({"fixed": '{"one": 1}'}, "'one' is not an index"),
         ({"fixed": '{"1": "0"}'}, "the value at 1 is not a finite number"),
         ({"fixed": '{"1": NaN}'}, "the value at 1 is not a finite number"),
         ({"fixed": '{"1": 1e39}'}, "fixed[1] is not a finite number"),
@@ -195,7 +195,7 @@ def npz_with_objects() -> bytes:
 
 
 BAD = {
-    **{f"garbage as {f}": (b"\x93 no mesh at all \xff\x00" * 20, f, "Send one") for f in FORMATS},
+    **{f"garbage as {f}": (b"\x93 no mesh at all \xff\x00" * 20, f, "Send a correct") for f in FORMATS},
     **{f"half a {f}": (written(f)[: len(written(f)) // 2], f, "") for f in ("glb", "gltf", "ply", "npz")},
     "nothing": (b"", "obj", "The file is empty"),
     "NaN": (written("npz", NAN), "npz", "Vertex 5 has a coordinate that is not a finite number"),
@@ -205,7 +205,7 @@ BAD = {
     "a face less": (written("ply", faces=MESH.faces[1:]), "ply", "has 127 faces, but the model's has 128"),
     "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "inside out"),
     "faces out of range": (as_json(MESH.vertices, MESH.faces + 1), "json", "vertices 1 to 64"),
-    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "if the faces are in the model's order"),
+    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Send the faces in the model's order"),
     "a single point": (as_json(0 * MESH.vertices), "json", "no edge has a length"),
     "JSON of numbers": (b"[1, 2, 3]", "json", "not an object"),
     "JSON of text": (b'{"vertices": ["a", "b"]}', "json", "vertices must be"),
@@ -233,9 +233,9 @@ def test_requests_without_a_known_format_or_a_file_are_refused(client: httpx.Cli
     content = mesh_file(client, "obj").content
     for arguments, status, says in (
         ({"content": b"neither a mesh nor points"}, 415, "neither its content nor a name or a media type"),
-        ({"content": content, "headers": {"Content-Type": "image/png"}}, 415, "image/png tells no format"),
+        ({"content": content, "headers": {"Content-Type": "image/png"}}, 415, "image/png is not the media type"),
         ({"content": content, "params": {"format": "fbx"}}, 415, "no format 'fbx' here"),
-        ({"files": {"file": ("shape.fbx", content)}}, 415, "tells no format"),
+        ({"files": {"file": ("shape.fbx", content)}}, 415, "is not the extension of a format"),
         ({"files": {"a": ("a.obj", content), "b": ("b.obj", content)}}, 400, "Too many files"),
         ({"files": {"a": (None, "text")}}, 422, "no file"),
         ({"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}, 400, "Missing boundary"),

@@ -132,7 +132,7 @@ def test_a_late_search_answers_its_best_result_so_far(hurried: httpx.Client, fig
         assert np.isfinite(found["latent"]).all()
         assert np.shape(found["covariance"]) == (20, 20)
         assert found["diagnostics"]["status"] == "converged"  # the result itself is complete
-        assert "time was over" in found.get("reason", "time was over")
+        assert "time ended" in found.get("reason", "time ended")
 
 
 def test_a_search_without_a_result_is_late_with_advice_for_searches(small_models: Path) -> None:

@@ -83,14 +83,14 @@ def test_a_field_chooses_the_version(client: httpx.Client) -> None:
     [
         ({"samples": "banana"}, "samples"),
         ({"nosie": "1"}, "no field 'nosie' here: choose among fixed, samples, seed"),
-        ({"fixed": '{"one": 1}'}, "'one' is no index"),
+        ({"fixed": '{"one": 1}'}, "'one' is not an index"),
         ({"fixed": "{"}, "fixed is not JSON"),
         ({"options": "{"}, "options is not JSON"),
         ({"options": '{"nosie": 1}'}, "options.nosie"),
         ({"options": '{"samples": "2"}'}, "options.samples"),
         ({"options": '{"samples": 2}', "samples": "2"}, "samples as a field and in options"),
         ({"samples": ["1", "2"]}, "the field 'samples' twice"),
-        ({"samples": b"\xff\xfe\x00"}, "'samples' is no text"),
+        ({"samples": b"\xff\xfe\x00"}, "'samples' is not text"),
     ],
 )
 def test_a_wrong_field_is_named(client: httpx.Client, call: str, fields: dict[str, Any], says: str) -> None:
@@ -140,7 +140,7 @@ REFUSED: dict[str, tuple[bytes, str, str | None, int, str]] = {
     "a picture, said to be OBJ": (PNG, "shape", "obj", 422, "it is a PNG picture"),
     "bytes": (b"\x01\xfe\xfa\0" * 50, "shape.obj", None, 422, "The server read it as obj, as its name says"),
     "a packed file": (gzip.compress(OBJ), "shape.obj.gz", None, 415, "unpack it first"),
-    "an extension": (OBJ, "shape.fbx", None, 415, ".fbx tells no format"),
+    "an extension": (OBJ, "shape.fbx", None, 415, ".fbx is not the extension"),
     "UTF-16 without a mesh": ("hello\n".encode("utf-16"), "shape.obj", None, 422, "it holds no vertices"),
     "a GLB, said to be PLY": (
         MESH_FORMATS["glb"].encode(MESH.vertices, MESH.faces),

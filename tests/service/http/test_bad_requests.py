@@ -88,7 +88,7 @@ REQUESTS = {
     "a path beyond floats": post(PATHS, {"keyframes": [OK, [0, 0, 0]], "stop": 1e300}, 422, "not-finite", "finite"),
     "too long a path": post(PATHS, {"keyframes": LONG_PATH}, 422, "path-too-long", "Send fewer keyframes"),
     "unknown model": get("/v1/models/large", 404, "unknown-model", "/v1/models lists"),
-    "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "Choose one"),
+    "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "lists the models"),
     "a way out of the folder": get("/v1/models/..%2fsmall/mesh", 404, "not-found", "/openapi.json"),
     "unknown version": get(f"{MODEL}?version=3", 404, "unknown-version", "Choose one of 1, 2, 10"),
     "no version": get(f"{MODEL}?version=new", 404, "unknown-version", "Choose one of 1, 2, 10"),
@@ -102,7 +102,7 @@ REQUESTS = {
     "colours in STL": get(f"{MESH}?color=stretch&format=stl", 406, "not-acceptable", "STL files can't carry colours"),
     "no coloured format": get(f"{MESH}?color=stretch", 406, "not-acceptable", "ply", Accept="model/stl"),
     "unknown colours": get(f"{MESH}?color=heat", 422, "invalid-request",  "'stretch', 'bending' or 'spread' for color"),
-    "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "Add color=stretch or bending"),
+    "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "only for color=stretch"),
     "colours against text": get(f"{MESH}?color=bending&against=x", 422, "invalid-request", "?against=0.1,0.2"),
     "colours against a short code": post(
         f"{MESH}?color=bending&against=1", {"latent": OK}, 422, "wrong-length", "Send exactly 3"

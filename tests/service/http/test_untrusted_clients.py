@@ -537,7 +537,7 @@ def test_a_head_is_logged_as_one(quiet: Server) -> None:
 
 
 def test_a_server_for_all_says_that_it_has_no_key(tight: Server, quiet: Server) -> None:
-    assert "there is no key" in tight.log
+    assert "there is no API key" in tight.log
     assert "no key" not in quiet.log
 
 

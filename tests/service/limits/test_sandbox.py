@@ -97,7 +97,7 @@ def test_several_at_once_and_no_more_than_there_may_be(box: Sandbox) -> None:
         assert len(set(found)) <= 2
         busy = [threads.submit(call, box, "wait", seconds=3) for _ in range(2)]
         time.sleep(0.5)
-        with pytest.raises(LateError, match="every process was at work"):
+        with pytest.raises(LateError, match="every process was busy"):
             call(box, "echo", seconds=0.5)
         assert all(isinstance(future.exception(), LateError) for future in busy)
 
@@ -136,7 +136,7 @@ def test_a_process_that_does_not_listen_is_no_trap(children: Callable[[], set[in
     [
         ("crash", DiedError, "it died of SIGSEGV"),
         ("leave", DiedError, "it ended with status 3"),
-        ("kill", OutOfMemoryError, "as it does where memory runs out"),
+        ("kill", OutOfMemoryError, "probably because memory ran out"),
         ("babble", DiedError, "can't be read"),
         ("lie", DiedError, "can't be read"),
         ("objects", DiedError, "can't be read"),

@@ -194,7 +194,7 @@ def test_a_log_for_people_names_the_request_too(plain: Server) -> None:
     eventually(lambda: "[mine]" in plain.log)
     lines = plain.log.splitlines()
     assert [line for line in lines if re.fullmatch(r"INFO \S+ GET /v1/models 200 in [0-9.]+ s \[mine\]", line)]
-    assert any("SHAPESPACE_COLOUR is no setting" in line for line in lines)
+    assert any("SHAPESPACE_COLOUR is not a setting" in line for line in lines)
 
 
 def test_a_key_opens_all_but_what_is_open(guarded: Server) -> None:

@@ -104,7 +104,7 @@ def test_a_bad_bundle_is_refused_and_what_was_loaded_stays(shared: tuple[Path, S
         found = samples(client)
     refusals = [line for line in server.log.splitlines() if "factor-0.onnx does not have the digest" in line]
     assert len(refusals) == 2
-    assert "bundle small/1 is refused, and what was loaded before stays" in refusals[0]
+    assert "bundle small/1 is refused, and the bundle loaded before stays" in refusals[0]
     assert "bundle small/2 is not served" in refusals[1]
     assert value(found, "shapespace_bundles_refused") == 2
 
@@ -119,7 +119,7 @@ def test_models_out_of_reach_stay_loaded(shared: tuple[Path, Server]) -> None:
         folder.with_name("elsewhere").rename(folder)
         reload(server)
         assert value(samples(client), "shapespace_reloaded_bundles_total", result="failed") == 1
-    assert "can't be read, so that nothing changes" in server.log
+    assert "can't be read, so nothing changes" in server.log
     assert "Errno" not in server.log
 
 

@@ -122,7 +122,7 @@ def material(**changes: object) -> Callable[[Path], None]:
         (material(color=[2, 0, 0, 1]), "surface.materials.0.color"),
         (material(name="a\nb"), "surface.materials.0.name"),
         (entry(objects=["torus"] * 10_001), "surface.objects"),
-        (entry(groups=[]), "surface: names of groups and the polygons that have them go together"),
+        (entry(groups=[]), "surface: there are names of groups without polygons"),
         (entry(groups=["one"]), "surface: a group is numbered -1 to 1, but there are 1"),
         (arrays(starts=None), "surface: there is no array surface_starts"),
         (arrays(starts=np.array([0, 3])), "surface: polygons do not begin at the first corner and end at the last"),

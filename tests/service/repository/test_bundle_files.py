@@ -78,10 +78,10 @@ def _one_file(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("build", "says"),
     [
-        (_with_a_note, "holds notes.txt, which no export wrote"),
-        (_meshes, "holds pose.obj, which no export wrote"),
-        (_other_manifest, "holds manifest.json, which no export wrote"),
-        (_one_file, "is no folder"),
+        (_with_a_note, "holds notes.txt, which no export has written"),
+        (_meshes, "holds pose.obj, which no export has written"),
+        (_other_manifest, "holds manifest.json, which no export has written"),
+        (_one_file, "is not a folder"),
     ],
 )
 def test_a_folder_that_holds_anything_else_is_not_replaced(

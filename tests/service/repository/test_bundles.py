@@ -209,7 +209,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     "flip a bit": (flip_a_bit, "factor-0.onnx does not have the digest"),
     "promise a petabyte": (promise_a_petabyte, "not 1125899906842624 as the manifest says"),
     "truncate": (bytes_of(GEOMETRY, lambda data: data.__delitem__(slice(-10, None))), "geometry.npz has"),
-    "append": (bytes_of(GEOMETRY, lambda data: data.extend(b"more")), "geometry.npz is longer than"),
+    "append": (bytes_of(GEOMETRY, lambda data: data.extend(b"more")), "geometry.npz has more than"),
     "add a file": (lambda folder: (folder / "run.sh").write_text("echo"), "run.sh is not in the manifest"),
     "add a folder": (lambda folder: (folder / "more").mkdir(), "more is a link or not a plain file"),
     "remove a file": (lambda folder: (folder / "combiner.onnx").unlink(), "combiner.onnx is missing"),
@@ -228,7 +228,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     "more edges": (manifest_with(edges=193), "the manifest says"),
     "NaN weight": (network_with(nan_weight), "combiner.onnx: z has a weight that is not finite"),
     "infinite constant": (network_with(infinite_constant), "combiner.onnx: c has a weight that is not finite"),
-    "external data": (network_with(external_data, FACTOR), "keeps its data in another file"),
+    "external data": (network_with(external_data, FACTOR), "has its data in another file"),
     "wrong width": (network_with(factor_of(7), FACTOR), "factor-0.onnx must have one output"),
     "wrong output name": (network_with(factor_of(WIDTH, "z"), FACTOR), "factor-0.onnx must have one output"),
     "one code only": (network_with(one_code_only, FACTOR), "factor-0.onnx must have one input"),
@@ -305,7 +305,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     ),
     "too large for its file": (
         lambda folder: hostile.unpacks(folder, 2**22),
-        "geometry.npz: its arrays would come to",
+        "geometry.npz: its arrays would have",
     ),
     "less than it unpacks to": (
         bytes_of(GEOMETRY, put_in_directory(24, *(200).to_bytes(4, "little")), sealed=True),
@@ -317,7 +317,7 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     ),
     "packed in another way": (
         bytes_of(GEOMETRY, put_in_directory(10, *(14).to_bytes(2, "little")), sealed=True),  # LZMA
-        "geometry.npz is not a readable NPZ file: vertices.npy is packed in a way",
+        "geometry.npz is not a readable NPZ file: vertices.npy is compressed in a way",
     ),
 }
 
@@ -403,7 +403,7 @@ ATTACKS: dict[str, tuple[Callable[[Path], object], str]] = {
     "gives another shape": (of(hostile.changes_shape), "factor-0.onnx gives (2, 384), not (1, 384)"),
     "is not finite": (of(hostile.not_finite), "does not give finite numbers for zeros"),
     "has no training codes": (of(hostile.no_codes), "training_codes is empty"),
-    "unpacks": (of(hostile.unpacks), "its arrays would come to 170000"),
+    "unpacks": (of(hostile.unpacks), "its arrays would have 170000"),
     "forges a line": (name_with_a_line_break, r"bad\nINFO shapespace: bundle forged is served/1 is not served"),
 }
 
@@ -447,12 +447,12 @@ def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
     monkeypatch.setattr(validation, "SECONDS", 8)
     repository = ModelRepository(tmp_path)
     assert [model.manifest.name for model in repository] == ["b"]
-    assert messages(caplog) == ["bundle a/1 is not served: tried in a process of its own, it took longer than 8 s"]
+    assert messages(caplog) == ["bundle a/1 is not served: loaded in a separate process, it took longer than 8 s"]
 
     write_bundle(tmp_path, "c")
     monkeypatch.setitem(sandbox.TASKS, "validate", "tests.service.tasks:crash_at_c")
     assert repository.reload() == Changes(refused=["a/1", "c/1"])
-    assert messages(caplog)[-1] == "bundle c/1 is not served: tried in a process of its own, it died of SIGSEGV"
+    assert messages(caplog)[-1] == "bundle c/1 is not served: loaded in a separate process, it died of SIGSEGV"
 
     monkeypatch.undo()
     shutil.rmtree(tmp_path / "a")
@@ -472,7 +472,7 @@ def test_only_the_bundle_that_was_tried_is_served(tmp_path: Path, caplog: pytest
     write_bundle(tmp_path, "small")
     repository = ModelRepository(tmp_path, validator=Swapping())
     assert list(repository) == []
-    assert messages(caplog) == ["bundle small/1 is not served: it changed while it was tried"]
+    assert messages(caplog) == ["bundle small/1 is not served: its files changed while the server tested it"]
     assert repository.reload() == Changes(loaded=["small/1"])
     assert repository.get("small").manifest.scale == 2 * SCALE
 

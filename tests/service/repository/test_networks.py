@@ -24,7 +24,7 @@ from tests.service.watching import SOON, eventually, samples, value
 
 GOOD = [0.1, 0.7, 0.4]
 TYPE = "urn:shapespace:problem:model-failed"
-FAILED = "The model's networks failed at this code. Choose another code or model, and tell whoever runs the server."
+FAILED = "The model's networks failed at this code. Choose another code or model, and tell the operator of the server."
 HARMS = {
     "loops": (hostile.loops, {}),
     "loops-if": (hostile.loops, {"nest": "if"}),

@@ -90,7 +90,7 @@ GRAPHS = {
     "a graph of nodes": (lambda: graph(800), 800_000, "lies in two others"),
     "nodes that double": (lambda: doubling(30), 2000, "lies in two others"),
     "a ring": (ring, 1000, "lies in another one"),
-    "a sparse accessor": (lambda: glb(document(accessors=ACCESSORS), BINARY), 1000, "more than there are data"),
+    "a sparse accessor": (lambda: glb(document(accessors=ACCESSORS), BINARY), 1000, "not enough data"),
     "an extension": (lambda: glb(document(extensionsRequired=["EXT_x"]), BINARY), 1000, "it requires EXT_x, which"),
 }
 

@@ -182,8 +182,8 @@ def test_a_second_set_of_joints_counts() -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda file: file.tree["skins"][0].update(joints=[1, 7]), "no node of the scene"),
-        (lambda file: file.tree["scenes"][0].update(nodes=[0]), "no node of the scene"),
+        (lambda file: file.tree["skins"][0].update(joints=[1, 7]), "not a node of the scene"),
+        (lambda file: file.tree["scenes"][0].update(nodes=[0]), "not a node of the scene"),
         (lambda file: file.tree["skins"][0].update(joints=[1]), "names joint 1"),
         (lambda file: file.tree["nodes"][0].update(skin=3), "not a readable glb file"),
     ],

@@ -68,13 +68,13 @@ REFUSED = {
     "a line of words": ("1 2 3\n4 five 6\n", "line 2 is '4 five 6'"),
     "another dialect later": ("1.5 2 3\n" * 500 + "1,5 2,5 3,5\n", "line 501 is '1,5 2,5 3,5'"),
     "two numbers": ("1 2\n", "line 1 is '1 2'"),
-    "fewer points than said": ("4\n" + rows(), "says that it has 4 points, and has 3"),
+    "fewer points than said": ("4\n" + rows(), "should have 4 points, but has 3"),
     "a running number that stops": (
         "".join(f"{k} 1 2 3\n" for k in [*range(500), 7]),
         "counts the points, but not in line 501",
     ),
     "nothing": ("", "line 1 is ''"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is no text"),
+    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is not text"),
 }
 
 
@@ -133,9 +133,9 @@ def test_pcd_is_read(kind: str) -> None:
     ("content", "says"),
     [
         (pcd("binary", ROWS.tobytes()[:-4]), "not a readable pcd file"),
-        (pcd("zipped", ROWS.tobytes()), "are zipped, which is not read"),
+        (pcd("zipped", ROWS.tobytes()), "are zipped, which can't be read"),
         (pcd("binary", ROWS.tobytes(), fields="rgb a b c"), "not x, y and z"),
-        (pcd("ascii", b"9 1 2 3\n"), "has 3 points, and has 1"),
+        (pcd("ascii", b"9 1 2 3\n"), "have 3 points, but has 1"),
         (pcd("binary_compressed", struct.pack("<II", 4, 48) + b"\xff\xff\xff\xff"), "damaged"),
         (b"1 2 3\n", "no line DATA"),
     ],

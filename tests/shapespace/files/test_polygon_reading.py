@@ -164,7 +164,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "OBJ: a number of a million digits": ("obj", LINE + b"f 1 1 " + b"9" * 10**6, "line 2 is 'f 1 1 9999"),
     "OFF: of four dimensions": ("off", b"4OFF\n1 0 0\n0 0 0 0\n", "line 1 is '4OFF'"),
     "OFF: rows are missing": ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n", "it ends before"),
-    "OFF: corners are missing": ("off", b"OFF\n1 1 0\n0 0 0\n3 0 0\n", "it ends before all that it says is there"),
+    "OFF: corners are missing": ("off", b"OFF\n1 1 0\n0 0 0\n3 0 0\n", "it ends before the data that it announces"),
     "OFF: less than none": ("off", b"OFF\n-1 -1 0\n", "not a readable off file"),
     "STL: without an end": ("stl", b"solid a\nvertex 0 0 0\nvertex 0 0 0\nvertex 0 0 0\n", "damaged"),
     "PLY: rows are missing": ("ply", ply_head("ascii", "element vertex 2", *XYZ) + b"0 0 0\n", "it ends before"),
@@ -173,7 +173,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
         ply_head("binary_little_endian", "element vertex 2", *XYZ) + bytes(23),
         "says 2 rows of vertex",
     ),
-    "PLY: no z": ("ply", ply_head("ascii", "element vertex 1", *XYZ[:2]) + b"0 0\n", "no x, y and z"),
+    "PLY: no z": ("ply", ply_head("ascii", "element vertex 1", *XYZ[:2]) + b"0 0\n", "lack x, y and z"),
     "PLY: a type nobody knows": (
         "ply",
         ply_head("ascii", "element vertex 1", "property real x"),

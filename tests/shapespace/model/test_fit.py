@@ -239,7 +239,7 @@ def test_what_is_no_such_shape_is_told_so(request: pytest.FixtureRequest, name: 
     found = request.getfixturevalue(name).fit_scan((solids[solid].vertices, solids[solid].faces))
     assert found.status is FitStatus.POOR
     assert found.explained < 0.9
-    assert "no such shape" in found.reason
+    assert "not a shape of this model" in found.reason
 
 
 @pytest.mark.parametrize("known", ["landmarks", pytest.param("fixed", marks=pytest.mark.long)])
@@ -321,11 +321,11 @@ def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel)
         (CLOUD[:, :2], {}, "(N, 3)"),
         (np.where(np.arange(50)[:, None] == 3, np.nan, CLOUD), {}, "Point 3"),
         (CLOUD * [1, 0, 1], {}, "in a plane"),
-        (np.ones((50, 3)), {}, "so small"),
+        (np.ones((50, 3)), {}, "too small"),
         (np.concatenate([np.zeros((990, 3)), CLOUD[:10]]), {}, "at one place"),
         (CLOUD, {"noise": 1e200}, "noise"),
         (CLOUD, {"scale": "free", "landmarks": [Landmark(5, [0, 0, 0])] * 3}, "at one place"),
-        (1e-200 * CLOUD, {"scale": "free"}, "so small"),
+        (1e-200 * CLOUD, {"scale": "free"}, "too small"),
         ((CLOUD, [[0, 1, 50]]), {}, "0 to 50"),
         (CLOUD, {"noise": 0.0}, "noise"),
         (CLOUD, {"noise": np.nan}, "noise"),

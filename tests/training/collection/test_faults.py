@@ -111,7 +111,7 @@ def test_every_file_that_is_left_out_is_listed_with_the_reason(tmp_path: Path) -
     assert notes == (
         "left out, as their formats are not read: no extension, pose1.mtl, README.md, scan.vtx, two\\nlines.fbx",
         "left out, as their names begin with a dot: .pose9.ply",
-        "left out, as they are folders, whose files are read only with --file: raw/",
+        "left out, as they are folders; --file reads one file from each: raw/",
     )
 
 
@@ -160,8 +160,8 @@ def test_a_folder_of_subjects_alone_is_refused_with_the_argument_that_reads_it(
     [
         ("none.ply", r"none of its folders has a file none\.ply; .*--file mesh\.obj"),
         ("mesh.fbx", r"the format of 'mesh\.fbx' is not read; these are: glb, "),
-        ("../mesh.obj", r"is no path within a folder"),
-        ("/mesh.obj", r"is no path within a folder"),
+        ("../mesh.obj", r"is not a path within a folder"),
+        ("/mesh.obj", r"is not a path within a folder"),
         ("*.obj", r"(?s)sub-1 +has 2 files \*\.obj .*sub-2 +has 2 files \*\.obj"),
     ],
 )
@@ -179,7 +179,7 @@ def test_accepting_takes_the_path_of_a_subject_s_file(tmp_path: Path) -> None:
     collection = read_collection(study, file="mesh.obj")
     for name in ("sub-3", "sub-3/mesh.obj"):
         collection.require_accepted([name])
-    with pytest.raises(IngestError, match=r"sub-3/mesh\.obj: is of another size"):
+    with pytest.raises(IngestError, match=r"sub-3/mesh\.obj: has another size"):
         collection.require_accepted([])
 
 
@@ -242,5 +242,5 @@ def test_names_of_files_that_break_lines_do_not_break_the_table(tmp_path: Path) 
 def test_a_file_whose_name_is_no_text_is_a_fault(tmp_path: Path) -> None:
     folder = balls(tmp_path / "meshes")
     (folder / os.fsdecode(b"pose\xff.obj")).touch()
-    with pytest.raises(IngestError, match=r"pose\\udcff\.obj: its name is no text in UTF-8; rename it"):
+    with pytest.raises(IngestError, match=r"pose\\udcff\.obj: its name is not valid UTF-8; rename it"):
         read_collection(folder)

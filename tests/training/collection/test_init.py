@@ -38,8 +38,8 @@ def test_values_come_from_the_meshes(tmp_path: Path) -> None:
     config, _ = load(out)
     assert config.collection.data == folder.resolve()
     assert config.collection.reference is None
-    assert f'the most central one, "{collection.names[collection.central]}"' in out.read_text()
-    assert "24 at most" in out.read_text()
+    assert f'"{collection.names[collection.central]}", the most central' in out.read_text()
+    assert "at most 24" in out.read_text()
     assert (config.export.name, config.export.title) == ("my-meshes-2", "My Meshes_2")
     assert "coarse_vertices" not in config.collection.model_fields_set
 
@@ -112,7 +112,7 @@ def test_an_npz_will_do(tmp_path: Path) -> None:
 def test_nothing_is_replaced_unless_asked_for(tmp_path: Path) -> None:
     folder, out = meshes(tmp_path / "meshes"), tmp_path / "here.toml"
     out.write_text("mine")
-    with pytest.raises(ConfigError, match=r"here\.toml: is there already; --force"):
+    with pytest.raises(ConfigError, match=r"here\.toml: exists already; --force"):
         write(folder, out)
     assert out.read_text() == "mine"
     write(folder, out, force=True)
@@ -139,7 +139,7 @@ def test_the_command_says_what_comes_next(
         "Next: shapespace-train run 'my meshes.toml'",
     ]
     assert run(monkeypatch, "init", folder) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert run(monkeypatch, "init", folder, "--force", "--out", "other.toml") == 0
     assert run(monkeypatch, "init", tmp_path / "none") == 1
     assert capsys.readouterr().err == f"shapespace-train: {tmp_path / 'none'}: no such file or folder\n"

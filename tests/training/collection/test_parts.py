@@ -145,7 +145,7 @@ def test_two_shells_of_size_are_refused_unless_one_keeps_its_form(tmp_path: Path
     hard = np.concatenate([shapes, np.repeat(0.9 * shapes[:1] + [3, 0, 0], 4, axis=0)], axis=1)
     np.savez(tmp_path / "soft.npz", vertices=soft, faces=faces)
     np.savez(tmp_path / "hard.npz", vertices=hard, faces=faces)
-    with pytest.raises(IngestError, match=r"2 separate parts, .*'part 2'.* too large .* train one model each"):
+    with pytest.raises(IngestError, match=r"2 separate parts, .*'part 2'.* too large .* train one model for each"):
         read_collection(tmp_path / "soft.npz")
     assert [part.name for part in read_collection(tmp_path / "hard.npz").parts] == ["part 1", "part 2"]
 
@@ -162,7 +162,7 @@ def with_specks(path: Path) -> int:
 
 def test_there_may_not_be_more_parts_than_an_answer_can_take(tmp_path: Path) -> None:
     count = with_specks(tmp_path / "specks.npz")
-    with pytest.raises(IngestError, match="121 separate parts, where 100 are allowed"):
+    with pytest.raises(IngestError, match="121 separate parts, but at most 100 are allowed"):
         read_collection(tmp_path / "specks.npz")
     assert len(read_collection(tmp_path / "specks.npz", ["part 1"]).faces) == count
 
@@ -194,8 +194,8 @@ def test_init_selects_parts_by_name(tmp_path: Path) -> None:
 def test_init_selects_the_largest_part_where_not_all_can_be_kept(tmp_path: Path) -> None:
     count = with_specks(tmp_path / "specks.npz")
     out, meshes = write(tmp_path / "specks.npz", tmp_path / "c.toml")
-    assert any("where 100 are allowed" in note for note in meshes.notes)
-    assert "the largest alone" in out.read_text()
+    assert any("at most 100 are allowed" in note for note in meshes.notes)
+    assert "only the largest" in out.read_text()
     sizes = listed_parts(out.read_text())
     assert len(sizes) == 121
     assert (sizes["part 1"], sizes["part 121"]) == (162, 3)

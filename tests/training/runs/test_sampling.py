@@ -127,7 +127,7 @@ def test_a_killed_process_costs_nothing_but_what_kills_all_ends_the_run(
     found = list(workers.run(partial(die_once, tmp_path / "dead"), range(5), workers=2))
     assert (tmp_path / "dead").exists()
     assert sorted(found) == [(k, k**2) for k in range(5)]
-    with pytest.raises(WorkersError, match="again and again"):
+    with pytest.raises(WorkersError, match="killed several times"):
         list(workers.run(signal.raise_signal, [signal.SIGKILL] * 2, workers=2))
 
 
@@ -179,7 +179,7 @@ def test_a_cluster_draws_the_same_though_a_worker_and_then_the_scheduler_are_kil
     for _ in range(5):
         next(progress)
     scheduler.kill()
-    with pytest.raises(WorkersError, match="the same command continues") as error:
+    with pytest.raises(WorkersError, match="give the same command again") as error:
         list(progress)
     assert "\n" not in str(error.value)
     assert 5 <= len(list((tmp_path / "b").iterdir())) < 20

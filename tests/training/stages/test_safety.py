@@ -43,7 +43,7 @@ def test_a_folder_with_other_files_is_left_alone(name: str, config: Path, tmp_pa
     (mine / name).parent.mkdir(parents=True)
     (mine / name).write_text("mine")
     said("run", config, "--out", mine, "--until", "ingest", code=1)
-    assert "is no run directory" in said.errors
+    assert "is not a run directory" in said.errors
     assert contents(mine) == {name: b"mine"}
 
 
@@ -105,10 +105,10 @@ def test_damaged_results_are_named_and_made_again(config: Path, tmp_path: Path, 
     arrays = NpzFile(part).read()
     flip(part, part.read_bytes().index(b"nric.npy") + 5000)
     words = said(*run, "networks")
-    assert "samples/part-00001.npz: damaged, so it is removed, and samples makes it again" in words
+    assert "samples/part-00001.npz: is damaged and was removed; the stage samples computes it again" in words
     np.testing.assert_equal(NpzFile(part).read(), arrays)
     RunDirectory(out).stamp("samples").path.write_bytes(b"damaged")
-    assert "stages/samples.json: damaged" in said(*run, "samples")
+    assert "stages/samples.json: is damaged" in said(*run, "samples")
     np.testing.assert_equal(NpzFile(part).read(), arrays)
 
 
@@ -153,7 +153,7 @@ def test_a_signal_ends_the_run_with_a_sentence_and_all_its_processes(
     said = process.communicate()[1]
     assert process.returncode == 128 + number
     lines = [line for line in said.replace("\r", "\n").splitlines() if line.strip() and "sample" not in line]
-    assert lines == ["shapespace-train: stopped; the same command continues here"]
+    assert lines == ["shapespace-train: stopped. The same command continues from here"]
     while processes(process.pid):  # ends by the tests' own limit, if ever
         time.sleep(0.01)
     shutil.rmtree(out)

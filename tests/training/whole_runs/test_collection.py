@@ -80,11 +80,11 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     }
     assert all(1e-6 < part["mean"] < part["max"] < 0.02 for part in parts.values())
     said = (run.parent / "said.txt").read_text()
-    assert "3 separate parts: the model computes with 'Bar'" in said
-    assert "Eye is carried rigidly: " in said
+    assert "3 separate parts: the model predicts 'Bar'" in said
+    assert "Eye is attached and moves rigidly" in said
     report = (run / "report.html").read_text()
     assert "<html" in report
-    assert "Eye, carried rigidly" in report
+    assert "Eye, attached, moves rigidly" in report
     unseen, encoded = (json.loads((run / f"{name}.json").read_text()) for name in ("generalisation", "encoded"))
     assert figures["generalisation"] == unseen
     assert (unseen["held_out"], unseen["counts"]) == (6, [2, 3])
@@ -107,7 +107,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     # What modes and these hasty networks miss is remembered; the fine mesh is still carried along.
     assert encoded["remembered"]
     assert encoded["mean"] < 0.5 * encoded["modes"]["mean"]
-    assert report.index("Shapes it has not seen") < report.index("Shapes it has learned from") < report.index("R²")
+    assert report.index("Unseen shapes") < report.index("Training shapes") < report.index("R²")
     events = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     assert [e["stage"] for e in events if e["event"] == "end"] == list(STAGES)
     assert all(e["time"] for e in events)
