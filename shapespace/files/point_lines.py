@@ -77,4 +77,4 @@ def fault(text: str, place: int, line: str, beside: tuple[int, str] | None = Non
             f"{says}, and line {line_number(text, beside[0])} is {quoted(beside[1])}: write all lines in the same way, "
             "with decimal points"
         )
-    return ValueError(f"{says}, and has no three numbers in front: write x, y and z there, with decimal points")
+    return ValueError(f"{says}, which does not begin with three numbers: write x, y and z there, with decimal points")

@@ -1,7 +1,7 @@
 """Point clouds as text: XYZ, PTS, CSV and TXT in the dialects of scanners, spreadsheets and ParaView.
 
 Such a file does not name its dialect. `_Dialect.of` finds it in the first lines: the separator of columns, a decimal
-comma, and the columns of x, y and z (`point_columns`). A file that can be read in two ways is refused, and the message shows both.
+comma, and the columns of x, y and z. A file that can be read in two ways is refused, and the message shows both.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def read_point_text(data: memoryview, limits: Limits) -> tuple[FloatArray, IntAr
     points, counts = _Dialect.of(text).read(text)
     limits.check(len(points), 0)
     if counts and sum(counts) != len(points):
-        raise ValueError(f"it says that it has {sum(counts)} points, and has {len(points)}")
+        raise ValueError(f"it should have {sum(counts)} points, but has {len(points)}")
     missing = np.isnan(points).any(axis=1)
     return points[~missing] if missing.any() else points, np.zeros((0, 3), np.int64)
 
@@ -68,7 +68,7 @@ def _decoded(data: memoryview) -> str:
     except UnicodeDecodeError:
         text = str(data, "cp1252", "replace")
     if _NO_TEXT.search(text[:1000]) or "\ufffd" in text[:1000]:
-        raise ValueError("it is no text")
+        raise ValueError("it is not text")
     return text if text.isascii() else text.translate(_MINUS)
 
 

@@ -160,7 +160,7 @@ REFUSED = {
         "counts the points, but not in line 501",
     ),
     "nothing": ("", "no line with three numbers"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is no text"),
+    "a picture": (b"\x89PNG\r\n\x1a\n\x00\x00", "it is not text"),
 }
 
 
