@@ -1,4 +1,4 @@
-"""Faults of meshes in correspondence: another order of vertices, a mirror image, another size or shape, vertices far off.
+"""Faults of meshes in correspondence: another order of vertices, a mirror image, another size, another kind of shape.
 
 A search finds a code for such a mesh too, but the code does not describe it. The checks compare
 the mesh with the shape of the code. `init` uses the same signs for the meshes of a collection.
