@@ -203,7 +203,7 @@ BAD = {
     "another mesh": (written("obj", OTHER.vertices, OTHER.faces), "obj", "has 3 vertices and 1 faces, but those of"),
     "other faces": (written("ply", faces=MESH.faces[:, [0, 1, 2]] % 60), "ply", "No face joins vertices"),
     "a face less": (written("ply", faces=MESH.faces[1:]), "ply", "has 127 faces, but the model's has 128"),
-    "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "inside out"),
+    "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "turn them, and mirror the mesh too if"),
     "faces out of range": (as_json(MESH.vertices, MESH.faces + 1), "json", "vertices 1 to 64"),
     "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Send the faces in the model's order"),
     "a single point": (as_json(0 * MESH.vertices), "json", "no edge has a length"),
