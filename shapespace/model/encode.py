@@ -232,7 +232,7 @@ class Encoder:
 
     @cached_property
     def _patch_of(self) -> IntArray:
-        """The patch (V,) of each vertex, with about 16 vertices or more in a patch where the mesh has so many."""
+        """The patch (V,) of each vertex. Patches have PATCH_VERTICES vertices or more, or are the whole mesh."""
         vertices = len(self._decoder.reference.vertices)
         large = [patch for patch in self._patches if (int(patch.max()) + 1) * PATCH_VERTICES <= vertices]
         return large[-1] if large else np.zeros(vertices, np.int64)

@@ -183,7 +183,7 @@ def mirror_image(given: float, mirrored: float) -> EncodeFault | None:
 
 
 def patch_distance(misfit: FloatArray, patches: IntArray) -> float:
-    """Return the mean length of the mean displacements of patches, which noise hardly moves.
+    """Return the mean length of the mean displacements of patches. Noise changes it little.
 
     Displacements are (V, 3), and patches (V,) the number of the patch of each vertex.
     """
