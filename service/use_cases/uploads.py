@@ -175,8 +175,8 @@ def _read_archive(data: memoryview, limits: Limits, *, points: bool, most: int) 
                 if entries := [e for e in there if _extension(e.filename) in formats]:
                     break
             if not entries:
-                names = clipped(", ".join(label(e.filename) or "" for e in there)) or "nothing"
-                raise MeshError(f"the archive holds no mesh file, only {names}")
+                names = clipped(", ".join(label(e.filename) or "" for e in there))
+                raise MeshError(f"the archive holds no mesh file, only {names}" if names else "the archive is empty")
             if len(entries) > most:
                 many = f"more than {most} meshes" if most > 1 else f"{len(entries)} meshes, where one is needed"
                 raise MeshError(f"the archive holds {many}: send fewer at once")

@@ -141,12 +141,11 @@ class GltfDocument:
         return roots
 
     def placed_meshes(self) -> Iterator[PlacedMesh]:
-        """Yield the meshes of the scene, each as its node poses it."""
+        """Yield the meshes of the scene in the order of its nodes, each as its node poses it."""
         if not self.nodes:
             yield from (PlacedMesh(mesh, {}, None, {}) for mesh in self.meshes)
         places: dict[int, FloatArray | None] = {}
-        # The last root is first. Bundles and codes depend on this order.
-        waiting: list[tuple[int, FloatArray | None, int]] = [(root, None, 1) for root in self.roots()]
+        waiting: list[tuple[int, FloatArray | None, int]] = [(root, None, 1) for root in reversed(self.roots())]
         while waiting:
             number, outer, depth = waiting.pop()
             if depth > _MOST_LEVELS:
@@ -154,7 +153,7 @@ class GltfDocument:
             node = entry_at(self.nodes, number)
             inner = _matrix(node)
             places[number] = outer if inner is None else inner if outer is None else outer @ inner
-            waiting += [(child, places[number], depth + 1) for child in node.get("children", [])]
+            waiting += [(child, places[number], depth + 1) for child in reversed(node.get("children", []))]
         for number, place in places.items():
             node = self.nodes[number]
             if "mesh" in node:

@@ -26,13 +26,15 @@ from shapespace.files.gltf_document import (
     objects,
     read_document,
 )
-from shapespace.files.limits import UNLIMITED, Limits, label
+from shapespace.files.limits import UNLIMITED, Limits, clipped, label
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most primitives of a scene, counted at each of their places.
 _MOST_PRIMITIVES = 1000
 #: Modes of primitives that have triangles (3.7.2.1).
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+#: Modes of primitives that are points or lines.
+_WITHOUT_FACES = (0, 1, 2, 3)
 #: Component types that positions and indices may have.
 _POSITIONS, _INDICES = (5120, 5121, 5122, 5123, 5126), (5121, 5123, 5125)
 #: Component types of attributes whose elements are integers: glTF allows no larger ones there (3.7.2.1).
@@ -287,15 +289,19 @@ class Skin:
 
 
 def _placed_primitives(document: GltfDocument, *, every_target: bool) -> list[PlacedPrimitive]:
-    """Return every primitive of the scene, once for each node that places it."""
+    """Return every primitive of the scene, once for each node that places it. Points and lines are left out."""
     found: list[PlacedPrimitive] = []
+    left_out = False
     for placed in document.placed_meshes():
         for primitive in objects(placed.mesh, "primitives"):
+            if primitive.get("mode", _TRIANGLES) in _WITHOUT_FACES:
+                left_out = True
+                continue
             if len(found) == _MOST_PRIMITIVES:
                 raise MeshError(f"its scene has more than {_MOST_PRIMITIVES} parts")
             found.append(_placed_primitive(document, primitive, placed, every_target=every_target))
     if not found:
-        raise MeshError("holds no mesh")
+        raise MeshError("has only points or lines: export triangles" if left_out else "holds no mesh")
     return found
 
 
@@ -304,7 +310,7 @@ def _placed_primitive(
 ) -> PlacedPrimitive:
     mode, attributes = primitive.get("mode", _TRIANGLES), primitive["attributes"]
     if mode not in (_TRIANGLES, _STRIP, _FAN):
-        raise MeshError("has points or lines: export triangles only")
+        raise ValueError(f"{clipped(mode)} is no mode of a primitive")
     positions = Accessor.of(document, attributes["POSITION"], "VEC3", _POSITIONS)
     indices = None
     if "indices" in primitive:

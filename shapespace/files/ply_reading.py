@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits, as_utf8, clipped
 from shapespace.files.polygon_reading import Lines, TriangleFans, first_values
+from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes at the start of a file in which its header has to end.
 _LONGEST_HEADER = 2**16
@@ -23,6 +24,8 @@ _DTYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8",
     "uint64": "u8", "double": "f8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
+#: The start of a header whose lines end in a carriage return alone.
+_CARRIAGE_RETURNS = re.compile(rb"[^\r\n]*\r(?!\n)")
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
 
 
@@ -69,8 +72,8 @@ class PlyElement:
     def coordinates(self) -> list[int]:
         """Indices of the properties x, y and z; raises ValueError if one is missing."""
         names = [p.name for p in self.properties]
-        if self.lists or not {"x", "y", "z"} <= set(names):
-            raise ValueError("its vertices have lists, or lack x, y and z")
+        if not {"x", "y", "z"} <= set(names):
+            raise ValueError("its vertices lack x, y and z")
         return [names.index(axis) for axis in "xyz"]
 
     @property
@@ -101,6 +104,8 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         else:
             table.skip(element)
         wanted.discard(element.name)
+    if not len(faces) and any(element.name == "tristrips" and element.rows for element in elements):
+        raise MeshError("its faces are triangle strips (tristrips), which are not read: save it with faces")
     return vertices, faces
 
 
@@ -108,8 +113,8 @@ def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
     """Return whether a file is ASCII, its elements, and the content after its header."""
     data = as_utf8(data)
     head = bytes(data[:_LONGEST_HEADER])
-    end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
-    if not head.startswith(b"ply") or not end:
+    end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + (rb"\r" if _CARRIAGE_RETURNS.match(head) else rb"\r?\n"), head)
+    if not head[:3].lower() == b"ply" or not end:
         raise ValueError("damaged, or another kind of file")
     order, elements = None, list[PlyElement]()
     for line in head[: end.start()].splitlines():
@@ -149,11 +154,13 @@ class TextTable:
             self._lines.skip(element.rows)
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
-        """Return the properties ``which`` of an element without lists, (rows, k)."""
+        """Return the properties ``which`` of an element, which are no lists, (rows, k)."""
         values = array("d")
         with self._lines:
             for _ in range(element.rows):
                 row = self._lines.next().split()
+                for k in element.lists:  # shortens each list to its length, so that properties keep their indices
+                    row[k + 1 : k + 1 + int(row[k])] = []
                 values.extend(float(row[k]) for k in which)
         return np.array(values, np.float64).reshape(-1, len(which))
 
@@ -209,10 +216,25 @@ class BinaryTable:
         self._place += self._equal_rows(element).nbytes
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
-        """Return the properties ``which`` of an element without lists, (rows, k)."""
+        """Return the properties ``which`` of an element, which are no lists, (rows, k)."""
+        if element.lists:
+            return self._columns_beside_lists(element, which)
         rows = self._equal_rows(element)
         self._place += rows.nbytes
         return np.hstack([rows[f"{k}"] for k in which]).astype(np.float64)
+
+    def _columns_beside_lists(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
+        """Return the same where rows can have different lengths. The fields before a list end at its length."""
+        values = array("d")
+        sizes = [p.type.itemsize for p in element.properties]
+        for _ in range(element.rows):
+            place, (spans, self._place) = self._place, self._row(element)
+            starts, ends = list[int](), dict(zip(element.lists, spans, strict=True))
+            for k, size in enumerate(sizes):
+                starts.append(place)
+                place = ends[k][0] + max(ends[k][1], 0) * size if k in ends else place + size
+            values.extend(float(np.ndarray((), element.properties[k].type, self._data, starts[k])) for k in which)
+        return np.array(values, np.float64).reshape(-1, len(which))
 
     def polygons(self, element: PlyElement) -> IntArray:
         """Return the polygons in the rows of an element as triangles (F, 3)."""

@@ -10,6 +10,8 @@ import re
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from enum import Enum
 from itertools import islice, pairwise
 from typing import Self
 
@@ -24,8 +26,9 @@ from shapespace.mesh.triangle_mesh import MeshError
 _PIECE = 2**20
 ENDS_EARLY = "it ends before the data that it announces"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-#: A line of OBJ that goes on in the next one.
-_CONTINUED = re.compile(rb"\\[ \t]*\r?\n")
+#: A comment of OBJ, which ends with its line, or the end of a line that goes on in the next one.
+_CONTINUES = rb"\\[ \t]*(?:\r\n?|\n)"
+_CONTINUED = re.compile(rb"((?<!\S)#[^\r\n]*+)|" + _CONTINUES)
 
 
 def _lines_with(start: bytes) -> re.Pattern[bytes]:
@@ -84,9 +87,13 @@ class Lines:
 
 
 def joined_lines(data: memoryview) -> memoryview:
-    """Return an OBJ or MTL text, in UTF-8, with lines that end in a backslash joined to the next one."""
+    """Return an OBJ or MTL text, in UTF-8, with lines joined that end in a backslash, except comments."""
     data = as_utf8(data)
-    return memoryview(_CONTINUED.sub(b" ", data)) if _CONTINUED.search(data) else data
+    return memoryview(_CONTINUED.sub(rb"\1 ", bytes(data))) if re.search(_CONTINUES, data) else data
+
+
+#: The keyword of OFF, and what follows on its line.
+_OFF = re.compile(rb"(?i:((?:ST)?[CN]{0,2})OFF)(\s+BINARY\b.*|[\s\d].*)?", re.IGNORECASE)
 
 
 class TriangleFans:
@@ -130,6 +137,8 @@ def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
                 here = len(coordinates) // 3
                 corners = values[0].partition(b"#")[0].split()
                 numbers = map(int, corners if b"/" not in values[0] else (c.partition(b"/")[0] for c in corners))
+                if len(corners) in (1, 2):  # a point or a line
+                    continue
                 # Negative numbers count back from the last vertex before this line.
                 triangles.add([number - 1 if number > 0 else here + number for number in numbers])
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
@@ -143,29 +152,61 @@ def _point(values: bytes) -> tuple[float, float, float]:
 def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Return vertices (V, 3) and faces (F, 3) of an OFF file; colours, normals and texture coordinates are ignored.
 
-    The keyword can be OFF with any of ST, C and N in front. Counts and rows may go on in the next line.
+    The keyword can be OFF with any of ST, C and N in front. Counts and rows may go on in the next line, or share one.
+    Some files lack the colours or normals that the keyword says. So the first of three layouts that explains the whole
+    file counts.
     """
+    try:
+        return _read_off(data, limits, OffLayout.ROWS)
+    except (ValueError, EOFError) as error:
+        if isinstance(error, MeshError):
+            raise
+        for layout in (OffLayout.PLAIN_ROWS, OffLayout.NUMBERS):
+            with suppress(ValueError, EOFError):
+                return _read_off(data, limits, layout)
+        raise
+
+
+class OffLayout(Enum):
+    """Layout of an OFF file: rows as the keyword says, rows that need no more than three numbers, or only numbers."""
+
+    ROWS = 1
+    PLAIN_ROWS = 2
+    NUMBERS = 3
+
+
+def _read_off(data: memoryview, limits: Limits, layout: OffLayout) -> tuple[FloatArray, IntArray]:
     coordinates, triangles = array("d"), TriangleFans(limits)
     with Lines(data) as lines:
-        found = re.fullmatch(rb"(?i:(?:ST)?[CN]{0,2}OFF)(\s+BINARY\b.*|[\s\d].*)?", lines.next())
+        found = _OFF.fullmatch(lines.next().partition(b"#")[0].rstrip())
         if not found:
             raise ValueError("another kind of file")
-        if found[1] and found[1].split()[0].upper() == b"BINARY":
+        prefix, rest = found[1].upper(), (found[2] or b"").split()
+        if rest and rest[0].upper() == b"BINARY":
             raise MeshError("it is binary OFF, which can't be read: save it as text")
-        counts = _row(lines, 1, (found[1] or b"").split())
-        counts = counts if len(counts) > 1 else _row(lines, 3, counts)
-        vertex_count, face_count = int(counts[0]), int(counts[1])
+        width = 3 if layout is OffLayout.PLAIN_ROWS else 3 + 2 * (b"ST" in prefix) + 3 * sum(map(prefix.count, b"CN"))
+        whole = layout is not OffLayout.NUMBERS
+        counts = _row(lines, 1, rest)
+        counts = counts if len(counts) > 1 and whole else _row(lines, 3, counts)
+        vertex_count, face_count, left = int(counts[0]), int(counts[1]), counts[3:]
         limits.check(vertex_count, face_count)
         if min(vertex_count, face_count) < 0:
             raise ValueError("less than none")
         while len(coordinates) < 3 * vertex_count:
-            coordinates.extend(map(float, _row(lines, 3)[:3]))
+            row = _row(lines, width, None if whole else left)
+            coordinates.extend(map(float, row[:3]))
+            left = row[width:]
         for _ in range(face_count):
-            row = _row(lines, 1)
+            row = _row(lines, 1, None if whole else left)
             corners = int(row[0])
             if len(row) != 1 + corners:
-                row = [row[0], *first_values(corners, _row(lines, 1 + corners, row)[1:])]
+                row = _row(lines, 1 + corners, row)
+                row, left = [row[0], *first_values(corners, row[1:])], row[1 + corners :]
+            else:
+                left = []
             triangles.add([*map(int, row[1:])])
+        if not whole and (left or next(iter(lines), None)):
+            raise ValueError("more numbers than it says")
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
 
 

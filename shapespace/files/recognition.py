@@ -22,7 +22,7 @@ _NUMBER = rb"[-+]?[\d.][\d.eE+-]*"
 _MAGIC = {
     "glb": rb"glTF",
     "gltf": rb'\s*\{(?s:.*?)"asset"\s*:\s*\{',
-    "ply": rb"ply\s",
+    "ply": rb"(?i:ply)\s",
     "stl": rb"\s*(?i:solid\b(?s:.*?)\bfacet\s+normal\s)",
     "off": rb"\s*(?:#[^\n]*\n\s*)*(?i:(?:ST)?[CN]{0,2}OFF)[\s\d]",
     "pcd": rb"#\s*\.PCD\b|VERSION\s+[\d.]+\s+FIELDS\s",
@@ -78,8 +78,8 @@ def decide(
 ) -> Assumed:
     """Return the format of a file.
 
-    The first bytes decide, then the extension of its name, then its media type. Media types that senders use for any
-    file don't count. Last, a text is recognised by its lines.
+    The first bytes decide, then the extension of its name, then its media type. Last, a text is recognised by its
+    lines. Extensions and media types that tell no format don't count.
 
     Args:
         data: content of the file.
@@ -94,20 +94,15 @@ def decide(
     suffix, media_type = PurePath(name).suffix.lstrip(".").lower(), media_type.lower()
     if found := _by_first_bytes(data):
         return _accepted(suffix if (found, suffix) == ("zip", "npz") else found, formats)
-    if suffix:
-        if suffix not in formats:
-            raise FormatError(
-                f"has no known format: .{label(suffix)} is not the extension of a format that can be read"
-            )
+    if suffix in formats:
         return Assumed(suffix, "its name")
-    if media_type not in _ANY_TYPE:
-        if media_types.get(media_type) not in formats:
-            raise FormatError(
-                f"has no known format: {clipped(media_type)} is not the media type of a format that can be read"
-            )
+    if media_type not in _ANY_TYPE and media_types.get(media_type) in formats:
         return Assumed(media_types[media_type], "its media type")
     if found := _by_lines(data):
         return _accepted(found, formats)
+    if suffix or media_type not in _ANY_TYPE:
+        what = f".{label(suffix)} is not the extension" if suffix else f"{clipped(media_type)} is not the media type"
+        raise FormatError(f"has no known format: {what} of a format that can be read")
     raise FormatError("has no known format: neither its content nor a name or a media type tells a format")
 
 

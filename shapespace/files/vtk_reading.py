@@ -34,6 +34,9 @@ _HEAD = re.compile(
 _SECTION = re.compile(
     rb"(?<=[\s])(POINTS|VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|POINT_DATA|CELL_DATA)[ \t]+(\d+)\b", re.IGNORECASE
 )
+_ANY_SECTION = re.compile(rb"(?<=\n)([A-Za-z_]{4,})[ \t]+\d+(?=[ \t\r\n])")
+#: Keywords that may begin a line with a number in a file of polygons.
+_KNOWN = ("POINTS", "VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "FIELD", "METADATA", "INFORMATION", "DATA")
 _LEGACY_CELLS = re.compile(rb"\w+\s+(\d+)\s+(\d+)(?=\s)")
 _XML_KIND = re.compile(rb"<VTKFile\b[^>]*?\btype\s*=\s*[\"'](\w+)[\"']")
 _XML_COUNT = re.compile(rb"\bNumberOf(Points|Verts|Lines|Strips|Polys)\s*=\s*[\"']\s*(\d+)")
@@ -61,12 +64,16 @@ def read_vtk(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     if not head:
         raise ValueError("damaged, or another kind of file")
     version, encoding, kind = int(head[1]), head[2], head[3].decode()
+    if not 1 <= version <= 5:
+        raise MeshError(f"it is version {version} of VTK's legacy files, and 1 to 5 are read")
     if kind.upper() != "POLYDATA":
         raise MeshError(_other_kind(kind))
     found = list(_SECTION.finditer(data, head.end()))
     ends = [match.start() for match in found[1:]] + [len(data)]
     vertices = np.zeros((0, 3))
     faces = dict.fromkeys(("POLYGONS", "TRIANGLE_STRIPS"), np.zeros((0, 3), np.int64))
+    if not {match[1].decode().upper() for match in found} & faces.keys():
+        _require_known_sections(data[head.end() :])
     for match, end in zip(found, ends, strict=True):
         name, count = match[1].decode().upper(), int(match[2])
         section = data[match.start() : end]
@@ -93,6 +100,8 @@ def read_vtp(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         raise ValueError("damaged, or another kind of file")
     if kind[1] != b"PolyData":
         raise MeshError(_other_kind(kind[1].decode()))
+    if not bytes(data[-1000:]).rstrip(b" \t\r\n\0").endswith((b"</VTKFile>", b"/>")):
+        raise ValueError("it is cut short")
     for match in _XML_COUNT.finditer(data):
         count = int(match[2])
         limits.check(count if match[1] == b"Points" else 0, count if match[1] == b"Polys" else 0)
@@ -115,6 +124,16 @@ def read_vtp(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         for cells, strips in ((found.GetPolys(), False), (found.GetStrips(), True))
     ]
     return vertices, _checked(np.concatenate(faces), len(vertices), limits)
+
+
+def _require_known_sections(data: memoryview) -> None:
+    """Raise MeshError if there is an unknown section before the attributes; it may have the faces."""
+    for match in _ANY_SECTION.finditer(data):
+        name = match[1].decode().upper()
+        if name.endswith("_DATA"):
+            break
+        if name not in _KNOWN:
+            raise MeshError(f"its section {clipped(name)} is not read: save the faces as POLYGONS")
 
 
 def _require_package() -> None:
@@ -178,6 +197,8 @@ def _vertices(found: vtkPolyData, count: int) -> FloatArray:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     points = found.GetPoints()
+    if points is None:
+        raise ValueError("it has no points")
     found_points = vtk_to_numpy(points.GetData())  # type: ignore[no-untyped-call]
     vertices: FloatArray = found_points.astype(np.float64)
     if vertices.shape != (count, 3):

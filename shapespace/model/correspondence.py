@@ -124,7 +124,10 @@ class _Layout:
         if not len(differing):
             return None
         if np.array_equal(_canonical(self.of_file[faces][:, ::-1]), own):
-            return "The faces are turned inside out."
+            return (
+                "The faces are turned inside out, as programs do with mirror images: turn them, and mirror the mesh "
+                "too if left and right are exchanged."
+            )
         return f"No face joins vertices {tuple(self.places[own[differing[0]]].tolist())} as in the model."
 
 

@@ -9,11 +9,20 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric
-from shapespace.mesh.rigid_motion import align, aligned_change
+from shapespace.mesh.rigid_motion import Placement, align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
 from shapespace.model.derivatives import derivatives
-from shapespace.model.encode_faults import EncodeCause, EncodeFault, OrderCheck, mirror_image
+from shapespace.model.encode_faults import (
+    THRESHOLDS,
+    EncodeCause,
+    EncodeFault,
+    OrderCheck,
+    far_from_all,
+    mirror_image,
+    other_size,
+    patch_distance,
+)
 from shapespace.model.encode_search import EncodePreparation, EncodeSearch, VertexObjective
 from shapespace.model.latent_space import Codes, Fixed, NotFiniteError
 from shapespace.model.options import EncodeOptions, Objective
@@ -26,6 +35,8 @@ from shapespace.solve.outcome import Status
 UNITS = 3.0
 #: Least standard deviation of a vertex that the posterior assumes, as a fraction of the diagonal.
 LEAST_DEVIATION = 2e-5
+#: Mean number of vertices, at least, of patches whose displacements are compared. Noise of a patch is much smaller.
+PATCH_VERTICES = 15
 #: How a search ended, in words; with any other status than these it is _STUCK.
 _STUCK = "The search stalled"
 _ENDS = {
@@ -123,6 +134,7 @@ class Encoder:
         shape = replace(coarse, vertices=decoder.finish(coarse.vertices / decoder.manifest.scale, given.mesh))
         placed = align(shape.vertices, given.vertices)
         distances = np.linalg.norm(placed - given.vertices, axis=1)
+        mean = float(distances.mean()) / (decoder.manifest.scale * decoder.reference.diagonal)
         z = decoder.nric(code.astype(np.float64))
         status = Status.DEADLINE if shape.diagnostics.status is Status.DEADLINE else fit.status
         fault = None
@@ -130,7 +142,14 @@ class Encoder:
             mirrored = EncodeSearch(self._prepared, *_mirrored(target, aim), fixed, options.bounds, searching)
             fault = self._mirror_image(search, fit.x, mirrored, z, options.objective)
             fault = fault or self._order_checks[given.mesh](given.vertices, placed)
-        mean = float(distances.mean()) / (decoder.manifest.scale * decoder.reference.diagonal)
+            if not fault and not fixed.mask.any() and options.objective is Objective.VERTICES:
+                times = self._times_larger(target)
+                resized = EncodeSearch(self._prepared, *_resized(target, aim, times), fixed, options.bounds, searching)
+                misfit = align(coarse.vertices / decoder.manifest.scale, vertices) - vertices
+                distance = patch_distance(misfit, self._patch_of) / decoder.reference.diagonal
+                if distance > THRESHOLDS.sized:
+                    fault = self._other_size(search, fit.x, resized, times, vertices)
+                fault = fault or far_from_all(distance, mean)
         ended = f"{_ENDS.get(status, _STUCK)}: the vertices lie {mean:.2g} of the diagonal away on average."
         return Encoded(
             code,
@@ -159,6 +178,21 @@ class Encoder:
         if norm.square(mirrored.difference(z)) >= norm.square(search.difference(z)):
             return None
         return mirror_image(search.away(x) / diagonal, mirrored.away(mirrored(objective).x) / diagonal)
+
+    def _times_larger(self, target: FloatArray) -> float:
+        """Return how many times as long most edges of a mesh are, by its lengths and angles (2E,), up to UNITS."""
+        half = len(target) // 2
+        return float(np.clip(np.median(target[:half] / self._prepared.centre[:half]), 1 / UNITS, UNITS))
+
+    def _other_size(
+        self, search: EncodeSearch, x: FloatArray, resized: EncodeSearch, times: float, vertices: FloatArray
+    ) -> EncodeFault | None:
+        """Return the fault of a mesh (V, 3) of another size than the shape of the code x, see `other_size`."""
+        decoder, diagonal = self._decoder, self._decoder.reference.diagonal
+        found = resized(Objective.VERTICES).x
+        shape = decoder.shape(decoder.latents.code(found.tolist())[0], mesh=MeshChoice.COARSE).vertices
+        scale = Placement.between(shape / decoder.manifest.scale, vertices, scaled=True).scale
+        return other_size(search.away(x) / (diagonal * times), resized.away(found) / diagonal, scale)
 
     @cached_property
     def _order_checks(self) -> dict[MeshChoice, OrderCheck]:
@@ -196,11 +230,24 @@ class Encoder:
         """Patches of the coarse mesh; made once, because they take as long as a shape."""
         return patches_of(self._decoder.reference.vertices)
 
+    @cached_property
+    def _patch_of(self) -> IntArray:
+        """The patch (V,) of each vertex. Patches have PATCH_VERTICES vertices or more, or are the whole mesh."""
+        vertices = len(self._decoder.reference.vertices)
+        large = [patch for patch in self._patches if (int(patch.max()) + 1) * PATCH_VERTICES <= vertices]
+        return large[-1] if large else np.zeros(vertices, np.int64)
+
 
 def _mirrored(target: FloatArray, aim: VertexObjective) -> tuple[FloatArray, VertexObjective]:
     """Return the lengths and angles (2E,) and the vertices of the mirror image of a mesh."""
     half = len(target) // 2
     return np.concatenate([target[:half], -target[half:]]), replace(aim, vertices=aim.vertices * [-1, 1, 1])
+
+
+def _resized(target: FloatArray, aim: VertexObjective, times: float) -> tuple[FloatArray, VertexObjective]:
+    """Return the lengths and angles (2E,) and the vertices of a mesh with coordinates divided by ``times``."""
+    half = len(target) // 2
+    return np.concatenate([target[:half] / times, target[half:]]), replace(aim, vertices=aim.vertices / times)
 
 
 def _extent(vertices: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""Faults of meshes in correspondence: another order of vertices, a mirror image, vertices far off.
+"""Faults of meshes in correspondence: another order of vertices, a mirror image, another size, another kind of shape.
 
 A search finds a code for such a mesh too, but the code does not describe it. The checks compare
 the mesh with the shape of the code. `init` uses the same signs for the meshes of a collection.
@@ -21,13 +21,16 @@ class EncodeCause(StrEnum):
     """Why a mesh is no shape of the model.
 
     ``order``: the vertices have another order. ``exchanged``: some vertices are exchanged. ``outliers``: some vertices
-    lie far off. ``mirrored``: the mesh is a mirror image.
+    lie far off. ``mirrored``: the mesh is a mirror image. ``size``: the mesh has another size than the model's shapes.
+    ``far``: no shape of the model is near.
     """
 
     ORDER = "order"
     EXCHANGED = "exchanged"
     OUTLIERS = "outliers"
     MIRRORED = "mirrored"
+    SIZE = "size"
+    FAR = "far"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,11 @@ class FaultThresholds:
         near: but within this share of its distance from the place of another vertex,
         jump: and the mean displacement of its neighbours differs by more than this share of its own.
         mirrored: a mesh is a mirror image if mirroring reduces the mean square distance to less than this share.
+        sized: a mesh has another size if its patches lie farther from the shape than this share of the diagonal,
+        resized: if resizing reduces the mean square distance to less than this share,
+        times: and if its size differs by at least this factor.
+        far: the mesh is no shape of the model if its patches lie farther than this share of the diagonal. Noise of 2 %
+            moves patches of 16 vertices by 0.8 %, and a flattened figure lies 2.4 % away.
     """
 
     scattered: float = 0.05
@@ -56,6 +64,10 @@ class FaultThresholds:
     near: float = 0.25
     jump: float = 0.5
     mirrored: float = 0.25
+    sized: float = 0.01
+    resized: float = 0.1
+    times: float = 1.03
+    far: float = 0.02
 
 
 THRESHOLDS = FaultThresholds()
@@ -168,3 +180,41 @@ def mirror_image(given: float, mirrored: float) -> EncodeFault | None:
         f"of the model, and {mirrored:.2g} if mirrored back. Change the sign of one coordinate."
     )
     return EncodeFault(EncodeCause.MIRRORED, sentence, np.zeros(0, np.int64))
+
+
+def patch_distance(misfit: FloatArray, patches: IntArray) -> float:
+    """Return the mean length of the mean displacements of patches. Noise changes it little.
+
+    Displacements are (V, 3), and patches (V,) the number of the patch of each vertex.
+    """
+    counts = np.bincount(patches)
+    sums = np.stack([np.bincount(patches, along) for along in misfit.T], axis=1)
+    return float(np.linalg.norm(sums / counts[:, None], axis=1) @ counts / len(patches))
+
+
+def other_size(given: float, resized: float, times: float) -> EncodeFault | None:
+    """Return the fault of a mesh that is much nearer to a shape of the model at another size.
+
+    The root mean square distances of both from their nearest shapes are shares of the mesh's diagonal.
+    """
+    if not resized**2 < THRESHOLDS.resized * given**2 or max(times, 1 / times) < THRESHOLDS.times:
+        return None
+    sentence = (
+        f"The mesh is about {times:.3g} times as large as the model's shape: it lies {given:.2g} of the diagonal away, "
+        f"and {resized:.2g} at the model's size. Multiply its coordinates by about {1 / times:.3g}."
+    )
+    return EncodeFault(EncodeCause.SIZE, sentence, np.zeros(0, np.int64))
+
+
+def far_from_all(distance: float, mean: float) -> EncodeFault | None:
+    """Return the fault of a mesh that is far from all shapes of the model.
+
+    The distance of its patches and the mean distance of its vertices are shares of the diagonal.
+    """
+    if distance <= THRESHOLDS.far:
+        return None
+    sentence = (
+        f"The nearest shape of the model lies {mean:.1%} of the diagonal away on average: the mesh is another kind of "
+        "shape, or it is stretched or flattened. Send a mesh like those that the model was trained on."
+    )
+    return EncodeFault(EncodeCause.FAR, sentence, np.zeros(0, np.int64))

@@ -401,5 +401,5 @@ class _Fit:
         else:
             status, reason = FitStatus.CONVERGED, f"{shares}."
         if self.scan.sampled:
-            reason += f" Of {self.scan.given} points, {len(self.scan.points)} spread evenly over the scan were used."
+            reason += f" {self.scan.replaced}"
         return status, reason

@@ -46,6 +46,12 @@ class Scan:
         away = np.linalg.norm(self.points - np.median(self.points, axis=0), axis=1)
         return float(np.sqrt((np.sort(away)[: max(1, int(0.9 * len(away)))] ** 2).mean()))
 
+    @property
+    def replaced(self) -> str:
+        """A sentence on the points that represent the original points or, if there are fewer, the original faces."""
+        whose = f"Of {self.given} points," if len(self.points) <= self.given else f"In place of {self.given} vertices,"
+        return f"{whose} {len(self.points)} points spread evenly over the scan were used."
+
     def some(self, count: int) -> Scan:
         """Return the first ``count`` points; their order is random."""
         return replace(self, points=self.points[:count], normals=self.normals[:count], trust=self.trust[:count])

@@ -223,7 +223,8 @@ class EncodeAnswer(BaseModel):
     reason: str = Field(description="The status in words.")
     cause: EncodeCause | None = Field(
         description="With `poor`: all vertices have another `order`, some vertices are `exchanged` or far off "
-        "(`outliers`), or the mesh is `mirrored`. Otherwise null."
+        "(`outliers`), the mesh is `mirrored` or has another `size`, or no shape of the model is near (`far`). "
+        "Otherwise null."
     )
     misplaced: list[int] = Field(description="Indices of vertices that are exchanged or lie far off, from 0.")
     iterations: int = Field(

@@ -203,7 +203,7 @@ BAD = {
     "another mesh": (written("obj", OTHER.vertices, OTHER.faces), "obj", "has 3 vertices and 1 faces, but those of"),
     "other faces": (written("ply", faces=MESH.faces[:, [0, 1, 2]] % 60), "ply", "No face joins vertices"),
     "a face less": (written("ply", faces=MESH.faces[1:]), "ply", "has 127 faces, but the model's has 128"),
-    "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "inside out"),
+    "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "turn them, and mirror the mesh too if"),
     "faces out of range": (as_json(MESH.vertices, MESH.faces + 1), "json", "vertices 1 to 64"),
     "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Send the faces in the model's order"),
     "a single point": (as_json(0 * MESH.vertices), "json", "no edge has a length"),
@@ -233,9 +233,9 @@ def test_requests_without_a_known_format_or_a_file_are_refused(client: httpx.Cli
     content = mesh_file(client, "obj").content
     for arguments, status, says in (
         ({"content": b"neither a mesh nor points"}, 415, "neither its content nor a name or a media type"),
-        ({"content": content, "headers": {"Content-Type": "image/png"}}, 415, "image/png is not the media type"),
+        ({"content": b"neither", "headers": {"Content-Type": "image/png"}}, 415, "image/png is not the media type"),
         ({"content": content, "params": {"format": "fbx"}}, 415, "no format 'fbx' here"),
-        ({"files": {"file": ("shape.fbx", content)}}, 415, "is not the extension of a format"),
+        ({"files": {"file": ("shape.fbx", b"neither")}}, 415, "is not the extension of a format"),
         ({"files": {"a": ("a.obj", content), "b": ("b.obj", content)}}, 400, "Too many files"),
         ({"files": {"a": (None, "text")}}, 422, "no file"),
         ({"content": b"x", "headers": {"Content-Type": "multipart/form-data"}}, 400, "Missing boundary"),

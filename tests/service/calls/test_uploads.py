@@ -124,12 +124,14 @@ def test_the_content_decides_the_format(client: httpx.Client) -> None:
         {"content": OBJ, "headers": {"Content-Type": "model/stl"}, "params": {"format": "OBJ"}},
         {"content": OBJ.decode().encode("utf-16"), "headers": {"Content-Type": "text/plain"}},
         {"files": {"file": ("shape.OBJ", OBJ, "image/png")}},
+        {"files": {"file": ("shape.dat", OBJ, "application/x-dat")}},
     ):
         assert found(client.post(ENCODE, **arguments))["latent"] == expected  # type: ignore[arg-type]
     scan = in_millimetres()
     for arguments in (
         {"files": {"file": ("cloud.xyz", scan, "text/plain")}, "params": {"scale": "free"}},
         {"content": scan, "headers": {"Content-Type": "text/plain"}, "params": {"scale": "free"}},
+        {"files": {"file": ("cloud.asc", scan)}, "params": {"scale": "free"}},
     ):
         assert found(client.post(FIT, **arguments))["placement"]["scale"] == pytest.approx(1000, rel=0.2)  # type: ignore[arg-type]
 
@@ -140,7 +142,7 @@ REFUSED: dict[str, tuple[bytes, str, str | None, int, str]] = {
     "a picture, said to be OBJ": (PNG, "shape", "obj", 422, "it is a PNG picture"),
     "bytes": (b"\x01\xfe\xfa\0" * 50, "shape.obj", None, 422, "The server read it as obj, as its name says"),
     "a packed file": (gzip.compress(OBJ), "shape.obj.gz", None, 415, "unpack it first"),
-    "an extension": (OBJ, "shape.fbx", None, 415, ".fbx is not the extension"),
+    "an extension": (b"hello", "shape.fbx", None, 415, ".fbx is not the extension"),
     "UTF-16 without a mesh": ("hello\n".encode("utf-16"), "shape.obj", None, 422, "it holds no vertices"),
     "a GLB, said to be PLY": (
         MESH_FORMATS["glb"].encode(MESH.vertices, MESH.faces),
@@ -213,6 +215,7 @@ def test_a_zip_of_mesh_files_is_read_in_natural_order(client: httpx.Client) -> N
     scan = found(client.post(FIT, content=zipped(cloud_xyz=in_millimetres()), params={"scale": "free"}))
     assert scan["placement"]["scale"] == pytest.approx(1000, rel=0.2)
     for files, says in (
+        ({}, "the archive is empty"),
         ({"a_txt": b"1 2 3"}, "holds no mesh file, only a.txt"),
         ({"a_obj": OBJ, "b_obj": b"v 1 2"}, "b.obj: not a readable obj file: line 1 is 'v 1 2'"),
         ({"a_obj": OBJ, "b_obj": PNG}, "b.obj: is a PNG picture"),

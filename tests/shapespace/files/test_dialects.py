@@ -48,10 +48,32 @@ def ply(property_name: str) -> bytes:
     return head.encode() + rows + b"".join(struct.pack("<B3i", 3, *face) for face in FACES.tolist())
 
 
+def cells(kind: str) -> bytes:
+    """Return a PLY file whose vertices have lists, of different lengths, before and after the coordinates."""
+    lists = [list(range(k)) for k in range(len(VERTICES))]
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex {len(VERTICES)}\nproperty list uchar short beside\nproperty float x\n"
+        f"property float y\nproperty list uchar short after\nproperty float z\nelement face {len(FACES)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    if kind == "ascii":
+        texts = [" ".join(map(str, [len(entries), *entries])) for entries in lists]
+        rows = [f"{text} {x} {y} {text} {z}" for text, (x, y, z) in zip(texts, VERTICES.tolist(), strict=True)]
+        return "\n".join([head.rstrip(), *rows, *TRIANGLES, ""]).encode()
+    packed = [struct.pack(f">B{len(entries)}h", len(entries), *entries) for entries in lists]
+    body = (
+        text + struct.pack(">2f", x, y) + text + struct.pack(">f", z)
+        for text, (x, y, z) in zip(packed, VERTICES.tolist(), strict=True)
+    )
+    return head.encode() + b"".join(body) + b"".join(struct.pack(">B3i", 3, *face) for face in FACES.tolist())
+
+
 MESHES: dict[str, tuple[str, str | bytes]] = {
     "OBJ": ("obj", OBJ),
     "OBJ with capital keywords": ("obj", OBJ.replace("v ", "V ").replace("f ", "F ")),
     "OBJ with lines that go on": ("obj", OBJ.replace("v 1 ", "v 1 \\\n").replace("f 1 ", "f \\\r\n1 ")),
+    "OBJ with a backslash that ends a remark": ("obj", "# saved as C:\\scans\\\n" + OBJ.replace("v 1 ", "v \\\n1 ")),
+    "OBJ with lines and points as faces": ("obj", OBJ + "f 1 2\nf 3\n"),
     "OBJ with a byte-order mark": ("obj", "\ufeff" + OBJ),
     "OBJ in UTF-16": ("obj", OBJ.encode("utf-16")),
     "OFF": ("off", off(f"OFF\n{COUNTS}")),
@@ -67,7 +89,18 @@ MESHES: dict[str, tuple[str, str | bytes]] = {
     "STOFF": ("off", off(f"STOFF\n{COUNTS}", " 0.5 0.5")),
     "OFF with colours of faces": ("off", off(f"OFF\n{COUNTS}", "", " 0.5 0.5 0.5")),
     "OFF with rows over several lines": ("off", off(f"OFF\n{COUNTS}").replace(" ", "\n")),
+    "OFF with a remark behind the keyword": ("off", off(f"OFF # by hand\n{COUNTS}")),
+    "OFF with several rows on a line": ("off", off(f"OFF\n{COUNTS}").replace("\n3 0", " 3 0").replace("\n1 ", " 1 ")),
+    "OFF on one line": ("off", off(f"OFF {COUNTS}", separator=" ")),
+    "NOFF with normals on their own lines": ("off", off(f"NOFF\n{COUNTS}", "\n0 0 1")),
+    "COFF with colours on their own lines": ("off", off(f"COFF\n{COUNTS}", "\n255 0 0 255")),
+    "COFF without colours": ("off", off(f"COFF\n{COUNTS}")),
     "PLY with a space in the name of a property": ("ply", ply("quality of scan")),
+    "PLY in capitals": ("ply", ply("quality").replace(b"ply", b"PLY", 1)),
+    "PLY with carriage returns": ("ply", cells("ascii").replace(b"\n", b"\r")),
+    "binary PLY with carriage returns": ("ply", ply("quality").replace(b"\n", b"\r", 11)),
+    "PLY with a list before x": ("ply", cells("ascii")),
+    "binary PLY with a list before x": ("ply", cells("binary_big_endian")),
 }
 SOUPS: dict[str, tuple[str, str | bytes]] = {
     "STL": ("stl", solid("a", FACES)),
@@ -80,7 +113,11 @@ ALONE = {
     "OBJ with capital keywords", "OBJ with a byte-order mark", "OBJ in UTF-16", "OFF with counts over two lines",
     "OFF with its counts glued to the keyword", "OFF in small letters", "OFF with remarks", "NOFF", "CNOFF", "NCOFF",
     "STOFF", "OFF with rows over several lines", "PLY with a space in the name of a property", "COFF",
-    "binary STL with bytes behind it",
+    "binary STL with bytes behind it", "OFF with several rows on a line", "OFF on one line", "COFF without colours",
+    "OFF with a remark behind the keyword", "NOFF with normals on their own lines", "PLY in capitals",
+    "COFF with colours on their own lines", "PLY with carriage returns", "binary PLY with carriage returns",
+    "PLY with a list before x", "binary PLY with a list before x", "OBJ with lines and points as faces",
+    "OBJ with a backslash that ends a remark",
 }  # fmt: skip
 
 
@@ -118,6 +155,11 @@ def test_polygons_of_several_sizes_are_cut_into_fans() -> None:
         (b"OFF BINARY\n\0\0\0\5", "off", "binary OFF"),
         (b"4OFF\n1 1 0\n", "off", "line 1 is '4OFF'"),
         (binary_stl()[:-1], "stl", "damaged"),
+        (
+            cells("ascii").replace(b"element face", b"element tristrips"),
+            "ply",
+            "triangle strips",
+        ),
     ],
 )
 def test_other_dialects_are_refused(content: bytes, format: str, says: str) -> None:

@@ -160,7 +160,6 @@ LINE = b"v 0 0 0\n"
 REFUSED: dict[str, tuple[str, bytes, str]] = {
     "OBJ: no number": ("obj", LINE + b"\nv 1 x 2\n", "line 3 is 'v 1 x 2'"),
     "OBJ: two numbers": ("obj", LINE + b"v 1 2\n", "line 2 is 'v 1 2'"),
-    "OBJ: two corners": ("obj", LINE + b"f 1 1\n", "line 2 is 'f 1 1'"),
     "OBJ: a number of a million digits": ("obj", LINE + b"f 1 1 " + b"9" * 10**6, "line 2 is 'f 1 1 9999"),
     "OFF: of four dimensions": ("off", b"4OFF\n1 0 0\n0 0 0 0\n", "line 1 is '4OFF'"),
     "OFF: rows are missing": ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n", "it ends before"),

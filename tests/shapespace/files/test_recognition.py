@@ -52,6 +52,9 @@ TEXT = b"1 2 3\n4 5 6\n"
 DECIDED = {
     "its name before its media type": (TEXT, "a.b.CSV", "model/obj", "csv", "its name"),
     "a specific media type": (TEXT, "", "model/OBJ", "obj", "its media type"),
+    "points with another extension": (TEXT, "cloud.asc", "application/pgp-keys", "xyz", "its content"),
+    "a mesh with another extension": (b"v 1 2 3\n", "p.dat", "application/octet-stream", "obj", "its content"),
+    "a media type and another extension": (b"?", "p.bin", "model/obj", "obj", "its media type"),
     "points as text/plain": (TEXT, "", "text/plain", "xyz", "its content"),
     "a mesh as text/plain": (b"# made by hand\no head\n v 1 2 3\n", "", "text/plain", "obj", "its content"),
     "JSON as any data": (b' {"vertices": []}', "", "application/octet-stream", "json", "its content"),

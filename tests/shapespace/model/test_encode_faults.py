@@ -45,6 +45,20 @@ def test_noise_is_no_mirror_image(model: ShapeModel, rng: np.random.Generator) -
         assert model.encode(noisy * [1, -1, 1]).cause is EncodeCause.MIRRORED
 
 
+def test_another_size_is_named_and_noise_and_a_stretched_shape_are_not(
+    bundled: ShapeModel, rng: np.random.Generator
+) -> None:
+    shape = bundled.decode(bundled.sample(1, 5)[0], mesh="coarse")
+    for times in (2, 0.9):
+        found = bundled.encode(shape * times)
+        assert (found.status, found.cause) == (Status.POOR, EncodeCause.SIZE)
+        assert f"about {times:.2g}" in found.reason
+    noise = 0.01 * np.linalg.norm(np.ptp(shape, axis=0)) * rng.normal(size=shape.shape)
+    assert bundled.encode(shape + noise).cause is None
+    assert bundled.encode(shape * [1, 1, 0]).cause is EncodeCause.FAR
+    assert bundled.encode(shape * [1, 1, 0], fixed={0: float(bundled.upper[0])}).cause is None
+
+
 def test_a_search_leaves_time_to_complete_its_result(figure: ShapeModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shapespace.solve.deadline.COMPLETING_SHARE", 1)
     monkeypatch.setattr("shapespace.solve.deadline.COMPLETING_SECONDS", 1e9)

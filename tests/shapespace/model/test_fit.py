@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.fit import SETTINGS
 from shapespace.model.fit_result import FitStatus, Fitted
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
 from shapespace.model.options import Landmark
-from shapespace.model.scan import InvalidScanError
+from shapespace.model.scan import InvalidScanError, scan_of
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
 from tests.service.conftest import ROOT
@@ -124,6 +125,13 @@ def test_another_mesh_is_fit_whichever_way_its_faces_are_turned(figure: ShapeMod
     assert given.error(turned) < 1e-3
     assert found.sampled
     assert f"Of {len(vertices)} points" in found.reason
+
+
+def test_points_on_faces_are_not_said_to_be_taken_from_fewer_points(figure: ShapeModel) -> None:
+    coarse = figure.decoder.reference.vertices, figure.decoder.mesh(MeshChoice.COARSE).faces
+    scan = scan_of(*coarse, np.random.default_rng(0))
+    assert len(scan.points) > len(coarse[0])
+    assert scan.replaced.startswith("In place of 1000 vertices, ")
 
 
 def test_a_size_is_found_where_it_is_free(figure: ShapeModel) -> None:
