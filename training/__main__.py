@@ -95,7 +95,7 @@ def parser() -> CommandParser:
     report = _add_command(
         commands, "report", "write RUN/report.html, with pictures and figures of all stages that are done"
     )
-    export = _add_command(commands, "export", "finish a run and write its bundle again")
+    export = _add_command(commands, "export", "finish a run, and write its bundle where it is missing or damaged")
     for command in (status, report, export):
         command.add_argument("run", type=Path, metavar="RUN")
     for command in (run, export):

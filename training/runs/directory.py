@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -97,12 +99,20 @@ class RunDirectory:
             file.write(json.dumps(line) + "\n")
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """Yield the lines of ``log.jsonl``, without a line that a kill cut short."""
-        for line in self._log.read_text(encoding="utf-8").splitlines() if self._log.exists() else ():
-            try:
-                yield json.loads(line)
-            except json.JSONDecodeError:
-                continue
+        """Yield the lines of ``log.jsonl``, without lines that are damaged, or that a kill cut short."""
+        for line in self._log.read_bytes().splitlines() if self._log.exists() else ():
+            with suppress(ValueError, RecursionError):
+                event = json.loads(line)
+                if isinstance(event, dict):
+                    yield event
+
+    def at_work(self) -> str:
+        """Return the progress of the running stage, from the last line of the log; empty if it reports none."""
+        last = deque(self.events(), maxlen=1)
+        if last and last[0].get("event") == "progress":
+            what, done, total = (last[0].get(fact) for fact in ("what", "done", "total"))
+            return f"{what}: {done} of {total}"
+        return ""
 
     # ingest
 
