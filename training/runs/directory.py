@@ -24,11 +24,6 @@ class NotARunError(ValueError):
     """A folder that holds something else than a run."""
 
 
-def _entries(folder: Path) -> list[Path]:
-    """List a folder; a file in its place is its only entry."""
-    return list(folder.iterdir()) if folder.is_dir() else [folder]
-
-
 class RunFile(Generic[File]):
     """A file or folder of each run directory, by its path there."""
 
@@ -72,8 +67,12 @@ class RunDirectory:
         """Make the folder a run directory, with what says so before anything else. Raises NotARunError if it holds
         something, and no run began it. Nothing is written or removed.
         """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise NotARunError(
+                f"{self.folder} is no folder, and a run's results lie in one: name an empty or a new folder with --out"
+            )
         # A run that was killed at its begin has left the folder of stamps and no configuration.
-        if self.folder.exists() and not self.was_begun() and {path.name for path in _entries(self.folder)} - {"stages"}:
+        if self.folder.exists() and not self.was_begun() and {path.name for path in self.folder.iterdir()} - {"stages"}:
             raise NotARunError(
                 f"{self.folder} holds other files and is not a run directory, so nothing was written there; name an "
                 "empty or a new folder with --out"

@@ -50,6 +50,7 @@ def test_a_folder_with_other_files_is_left_alone(name: str, config: Path, tmp_pa
 def test_a_file_in_place_of_the_folder_is_left_alone(config: Path, tmp_path: Path, said: Said) -> None:
     (tmp_path / "mine").write_text("mine")
     said("run", config, "--out", tmp_path / "mine", code=1)
+    assert "mine is no folder" in said.errors
     assert (tmp_path / "mine").read_text() == "mine"
 
 
@@ -89,6 +90,13 @@ def test_devices_are_no_collections(tmp_path: Path, said: Said) -> None:
         (tmp_path / f"{name}.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     said("run", config, "--out", tmp_path / "out", code=1)
     assert "pipe.obj: can't be read" in said.errors
+
+
+def test_devices_and_pipes_are_no_configurations(tmp_path: Path, said: Said) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    for place in ("/dev/zero", tmp_path / "pipe.toml"):
+        said("run", place, code=1)
+        assert f"{place}: can't be read: it is a device or a pipe" in said.errors
 
 
 def flip(path: Path, place: int) -> None:
