@@ -198,9 +198,9 @@ def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     run = "run", config, "--out", finished, "--models", finished / "models", "--until", "evaluation"
     status, words = said("status", finished), said(*run)
     for path, stage in before.items():
-        name, removed = path.relative_to(finished), ", so it is removed, and" if why == "damaged" else ", so"
+        name, removed = path.relative_to(finished), " and was removed" if why == "damaged" else ""
         assert f"{name} is {why}" in next(line for line in status.splitlines() if line.startswith(f"{stage} "))
-        assert f"{name}: {why}{removed} {stage} makes it again" in words
+        assert f"{name}: is {why}{removed}; the stage {stage} computes it again" in words
         if path.suffix == ".npz":
             assert path.read_bytes() == contents_before[path]
     assert "mean: done before" in words
@@ -216,7 +216,7 @@ def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished
         (bundle / "manifest.json").write_text("{")
     else:
         shutil.rmtree(models)
-    assert f"{bundle}: {why}, so export writes it again" in said("export", finished, "--models", models)
+    assert f"{bundle}: is {why}; the stage export writes it again" in said("export", finished, "--models", models)
     assert contents(bundle) == before
 
 
