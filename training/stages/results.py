@@ -86,10 +86,11 @@ def _intact(path: Path, facts: Mapping[str, Any]) -> bool:
     large = path.name.startswith("part-")
     if facts:
         return bool(file_facts(path, facts if large else {})["sha256"] == facts["sha256"])
-    kind = {".json": JsonFile, ".npz": NpzFile}.get(path.suffix)
     try:
-        if kind and not large:
-            kind(path).read()
+        if path.suffix == ".json":
+            JsonFile(path).read()
+        elif path.suffix == ".npz" and not large:
+            NpzFile(path).read()
     except DamagedFileError:
         return False
     return True

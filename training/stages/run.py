@@ -107,8 +107,8 @@ def _make_again(directory: RunDirectory, lost: LostFile, show: Callable[[str], N
         if "seconds" in stamp and (name == lost.stage or results & set(stage.rewrites(directory))):
             directory.stamp(name).write({key: value for key, value in stamp.items() if key != "seconds"})
     removed = " and was removed" if lost.why == "damaged" else ""
-    name = lost.path.relative_to(directory.folder)
-    show(f"{name}: is {lost.why}{removed}; the stage {lost.stage} computes it again")
+    file = lost.path.relative_to(directory.folder)
+    show(f"{file}: is {lost.why}{removed}; the stage {lost.stage} computes it again")
 
 
 def _check_results(run: Run, until: str | None, show: Callable[[str], None]) -> None:
