@@ -30,6 +30,8 @@ from shapespace.training.runs.config import load
 from shapespace.training.runs.network_settings import Recipe
 from shapespace.training.runs.sampling import split
 from shapespace.training.stages.networks import learner_of
+from shapespace.training.stages.results import remember
+from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 
 #: The studies of the runs behind the measurement pages, by the name of the run's folder.
@@ -246,6 +248,8 @@ def add(run: Run, studies: Studies) -> None:
     # The stage `networks` keeps the files of networks that have a history.
     directory.histories.write(directory.histories.read() | learner.histories)
     directory.evaluation.write(evaluation | found)
+    for name in ("networks", "evaluation"):
+        remember(STAGES[name], directory)
     directory.log("end", stage="studies", seconds=round(time.monotonic() - begun, 3))
     write_report(directory)
 

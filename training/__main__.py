@@ -6,6 +6,7 @@ This module imports none of the packages that training needs, so that ``--help``
 from __future__ import annotations
 
 import sys
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,19 @@ NEEDED = (
     "PIL", "jinja2", "joblib", "matplotlib", "onnx", "onnxruntime", "onnxscript", "pydantic", "safetensors",
     "tomlkit", "torch", "tqdm", "trimesh",
 )  # fmt: skip
+#: What ``init`` reads.
+MESHES = (
+    "folder of OBJ, PLY, STL, OFF, glTF or VTK files; or one NPZ file with all shapes; or one GLB or glTF file "
+    "whose morph targets are the shapes; or, with --file, a folder that has a folder for each subject"
+)
+SUBJECTS = "read this file from each folder in MESH_DIR, for data with one folder per subject; may have * and ?"
+
+
+def _path(text: str) -> Path:
+    """Return a path of the command line, which must not be empty, as after a misspelt variable of the shell."""
+    if not text:
+        raise ArgumentTypeError("it is empty; name a file or folder, . for this one")
+    return Path(text)
 
 
 def _add_command(commands: Any, name: str, purpose: str) -> CommandParser:
@@ -34,20 +48,20 @@ def parser() -> CommandParser:
     start = _add_command(commands, "init", "write a configuration for a folder of meshes in correspondence")
     start.add_argument(
         "meshes",
-        type=Path,
+        type=_path,
         metavar="MESH_DIR",
-        help="folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ or GLB file with all shapes",
+        help=MESHES,
     )
     start.add_argument(
         "--out",
-        type=Path,
+        type=_path,
         metavar="FILE.toml",
         help="file to write (default: the folder's name with .toml, in the current folder)",
     )
     start.add_argument(
         "--file",
         metavar="NAME",
-        help="read this file from each folder in MESH_DIR, for data with one folder per subject",
+        help=SUBJECTS,
     )
     start.add_argument(
         "--parts",
@@ -61,15 +75,15 @@ def parser() -> CommandParser:
     run = _add_command(
         commands, "run", "train the model of a configuration; a repeated command continues where the last one stopped"
     )
-    run.add_argument("config", type=Path, metavar="CONFIG.toml")
+    run.add_argument("config", type=_path, metavar="CONFIG.toml")
     run.add_argument(
         "--data",
-        type=Path,
+        type=_path,
         metavar="DIR",
         help="folder of meshes or NPZ file, instead of collection.data in CONFIG.toml",
     )
     run.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the results (default: runs/ and the name of CONFIG.toml)"
+        "--out", type=_path, metavar="DIR", help="folder for the results (default: runs/ and the name of CONFIG.toml)"
     )
     run.add_argument(
         "--until", choices=STAGE_NAMES, metavar="STAGE", help=f"stop after this stage: {', '.join(STAGE_NAMES)}"
@@ -95,12 +109,12 @@ def parser() -> CommandParser:
     report = _add_command(
         commands, "report", "write RUN/report.html, with pictures and figures of all stages that are done"
     )
-    export = _add_command(commands, "export", "finish a run and write its bundle again")
+    export = _add_command(commands, "export", "finish a run, and write its bundle where it is missing or damaged")
     for command in (status, report, export):
-        command.add_argument("run", type=Path, metavar="RUN")
+        command.add_argument("run", type=_path, metavar="RUN")
     for command in (run, export):
         command.add_argument(
-            "--models", type=Path, default=Path("models"), help="folder for the finished bundle (default: models)"
+            "--models", type=_path, default=Path("models"), help="folder for the finished bundle (default: models)"
         )
     return top
 

@@ -18,7 +18,7 @@ from shapespace.files.limits import in_words
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.learning import ExportError
-from shapespace.training.report.record import Record, ReportError
+from shapespace.training.report.record import ReportError, require_run
 from shapespace.training.runs import workers
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import ConfigError, load
@@ -28,8 +28,9 @@ from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
 from shapespace.training.space.modes import ModeError
 from shapespace.training.stages.mean import MeanError
+from shapespace.training.stages.results import lost_files
 from shapespace.training.stages.run import STAGES, LostTooMuchError, OldRunError, execute, refuse_old
-from shapespace.training.stages.stage import Run
+from shapespace.training.stages.stage import Run, listed
 
 #: Exit codes: a fault of the input or of the machine, and a defect of the program (EX_SOFTWARE).
 FAILURE, DEFECT = 1, 70
@@ -133,10 +134,14 @@ def _folder(arguments: argparse.Namespace) -> Path:
 
 def _status(arguments: argparse.Namespace) -> None:
     directory = RunDirectory(arguments.run)
-    begun = ": ".join(filter(None, ("begun", Record(directory).at_work)))
+    require_run(directory)
+    begun = ": ".join(filter(None, ("begun", directory.at_work())))
+    lost = list(lost_files(STAGES.values(), directory))
     for name in STAGES:
         stamp = directory.stamp(name).read_if_written()
         state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if "key" in stamp else "to do"
+        if faults := [f"{path.relative_to(directory.folder)} is {why}" for stage, path, why in lost if stage == name]:
+            state = f"to do again: {listed(faults)}"
         print(f"{name:12} {state}")
 
 

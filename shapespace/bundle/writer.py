@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,8 +69,10 @@ class Facts:
     draft_error: Mapping[str, float] | None = None
 
 
-def require_replaceable(folder: Path) -> None:
+def require_replaceable(folder: Path, names: Iterable[str] = ()) -> None:
     """Refuse a place for a bundle that holds anything but a bundle: writing there would delete it.
+
+    In a bundle whose manifest is missing or damaged, the usual files and those called ``names`` are the bundle's own.
 
     Raises:
         BundleError: the folder has files that are not of a bundle, or is a file or a link.
@@ -88,6 +90,9 @@ def require_replaceable(folder: Path) -> None:
         own = {MANIFEST, *json.loads((folder / MANIFEST).read_bytes())["files"]} if MANIFEST in present else set()
     except (OSError, ValueError, LookupError, TypeError):
         own = set()
+    if {COMBINER.file, GEOMETRY.file, factor_network(0).file} <= present:
+        own |= {MANIFEST, COMBINER.file, GEOMETRY.file, START.file, *names}
+        own |= {factor_network(j).file for j in range(len(present))}
     if others := sorted(present - own):
         named = ", ".join(map(clipped, others[:3])) + (", …" if len(others) > 3 else "")
         raise BundleError(f"{folder} holds {named}, which no export has written, so {remedy}")
@@ -113,7 +118,7 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
 
     folder = models / facts.name / facts.version
-    require_replaceable(folder)
+    require_replaceable(folder, files)
     with replaced_folder(folder) as part:
         for name, content in (files | {MANIFEST: text.encode()}).items():
             with synced_file(part / name) as file:

@@ -6,6 +6,7 @@ import errno
 import re
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -71,6 +72,13 @@ def clipped(text: object, most: int = 100) -> str:
     """Return text from a file on one line, shortened to ``most`` characters."""
     line = " ".join(str(text)[:1000].split())
     return line if len(line) <= most else f"{line[:most]}…"
+
+
+def read_plain(path: Path) -> bytes:
+    """Return the content of a file; raises OSError, also for a device or a pipe, which might never end."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "it is a device or a pipe, where a file is needed", str(path))
+    return path.read_bytes()
 
 
 #: Sentences about a file or folder, by the number of the system's error.

@@ -89,6 +89,8 @@ def mesh_files(folder: Path, file: str | None = None) -> MeshFiles:
     if unnamed:
         raise IngestError(*(Fault(path, "its name is not valid UTF-8", "rename it") for path in unnamed))
     if len(found.paths) < MIN_SHAPES:
+        if file and found.faults:
+            raise IngestError(*found.faults)
         if hint := "" if file else _nested(folder):
             raise IngestError(Fault(str(folder), f"has {len(found.paths) or 'no'} meshes, but its folders have", hint))
         if not found.paths:

@@ -29,6 +29,8 @@ from shapespace.training.collection.listing import MIN_SHAPES, TOO_FEW, MeshFile
 from shapespace.training.collection.part_names import difference
 from shapespace.training.runs.progress import progress
 
+#: What to do about a file that has only the first faces of another.
+_LACKING = "copy it again if the copy was cut short, or else export it with all faces"
 #: What to do about coordinates that are not finite.
 _NOT_FINITE = "correct that vertex, or leave the shape out"
 
@@ -208,7 +210,8 @@ def _unfinished(path: Path) -> str:
     """Return what to do about an OBJ file whose last line isn't finished, as after an interrupted copy."""
     if extension(path) != "obj" or not path.is_file():
         return ""
-    with path.open("rb") as file:
+    last = ""
+    with suppress(OSError), path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 200))
         last = file.read().decode(errors="replace")
     if last[-1:] in ("\n", "\r", "") or not last.replace("\n", "").replace("\r", "").isprintable():
@@ -223,7 +226,7 @@ def _refuse_cut_short(path: Path, count: int, faces: IntArray, other_count: int,
     # The last face may have lost digits.
     if count <= other_count and len(faces) < len(others) and np.array_equal(faces[:-1], others[: len(faces) - 1]):
         what = f"it ends after {count} of {other_count} vertices and {len(faces)} of {len(others)} faces"
-        raise IngestError(Fault(str(path), f"seems to be cut short: {what}", _unfinished(path) or "copy it again"))
+        raise IngestError(Fault(str(path), f"seems to be cut short: {what}", _unfinished(path) or _LACKING))
 
 
 def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int, other: str) -> FloatArray:

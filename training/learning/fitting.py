@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.files.atomic import replaced_file
 from shapespace.training.learning.networks import ShapeNetwork, predict
+from shapespace.training.runs.atomic_files import reading
 from shapespace.training.runs.network_settings import FitSettings
 from shapespace.training.runs.progress import bar
 
@@ -51,8 +52,8 @@ def save_network(
 
 
 def read_network(path: Path) -> SavedNetwork:
-    """Read a file of `save_network`."""
-    with safe_open(path, framework="pt") as file:
+    """Read a file of `save_network`; raises OSError or DamagedFileError."""
+    with reading(path), safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata())
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
     prefix = "network."

@@ -1,7 +1,6 @@
 """The files of a run's directory, as the report needs them."""
 
 import tomllib
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -15,7 +14,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.files.limits import in_words
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.runs.atomic_files import JsonFile, NpzFile
+from shapespace.training.runs.atomic_files import DamagedFileError, JsonFile, NpzFile
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.modes import edge_magnitudes
 from shapespace.training.stages.run import STAGES
@@ -38,11 +37,22 @@ class FactorRecord:
     modes: list[int]
 
 
+def require_run(run: RunDirectory) -> None:
+    """Raise ReportError unless a folder looks like a run directory."""
+    if not run.is_run():
+        raise ReportError(
+            f"{run.folder} is not a run directory: it has no config.toml; name a folder that run has written, such as "
+            "runs/NAME"
+        )
+
+
 def _readable(path: Path, read: Callable[[], Value]) -> Value:
     try:
         return read()
     except OSError as error:
         raise ReportError(f"{path} can't be read: {in_words(error, named=False)}") from error
+    except DamagedFileError as error:
+        raise ReportError(str(error)) from error
     except ValueError as error:
         raise ReportError(f"{path} can't be read: {str(error).splitlines()[0]}") from error
 
@@ -58,11 +68,7 @@ class Record:
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
-        if not run.is_run():
-            raise ReportError(
-                f"{run.folder} is not a run directory: it has no config.toml; name a folder that run "
-                "has written, such as runs/NAME"
-            )
+        require_run(run)
         self.text = _readable(run.config.path, run.config.read)
         self.config = _readable(run.config.path, lambda: tomllib.loads(self.text))
         self.reference, self.gallery, self.modes, mean = map(_read, (run.reference, run.gallery, run.modes, run.mean))
@@ -91,14 +97,6 @@ class Record:
             warnings = _readable(self.run.folder, partial(STAGES[stage].warnings, self.run))
             found += [(stage, warning.sentence) for warning in warnings]
         return found
-
-    @cached_property
-    def at_work(self) -> str:
-        """Progress of the running stage, from the last line of the log; empty if it reports none."""
-        last = deque(self.run.events(), maxlen=1)
-        if last and last[0].get("event") == "progress":
-            return "{what}: {done} of {total}".format(**last[0])
-        return ""
 
     def supports(self, tangents: FloatArray) -> FloatArray:
         """Return the supports (m, V) of tangent vectors (m, 2E): where they change the shape, between 0 and 1.

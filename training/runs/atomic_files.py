@@ -21,7 +21,7 @@ class DamagedFileError(ValueError):
     """A file of a run that can't be understood, with its path."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(f"{path} is damaged; run the same command again, which computes it again")
+        super().__init__(f"{path} is damaged; give the command run for this run again, which computes it again")
         self.path = path
 
 

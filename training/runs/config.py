@@ -9,7 +9,7 @@ from typing import Any
 import tomlkit
 from pydantic import Field, ValidationError, model_validator
 
-from shapespace.files.limits import in_words
+from shapespace.files.limits import in_words, read_plain
 from shapespace.shell.energy import Material
 from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings, NetworkSettings
 from shapespace.training.runs.settings import (
@@ -97,7 +97,7 @@ def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
     as it stands in the file. Raises ConfigError, which names the file and every faulty setting.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_plain(path).decode().replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"{path}: can't be read: it is not text in UTF-8; name a configuration, CONFIG.toml"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,11 +22,6 @@ File = TypeVar("File")
 
 class NotARunError(ValueError):
     """A folder that holds something else than a run."""
-
-
-def _entries(folder: Path) -> list[Path]:
-    """List a folder; a file in its place is its only entry."""
-    return list(folder.iterdir()) if folder.is_dir() else [folder]
 
 
 class RunFile(Generic[File]):
@@ -70,8 +67,12 @@ class RunDirectory:
         """Make the folder a run directory, with what says so before anything else. Raises NotARunError if it holds
         something, and no run began it. Nothing is written or removed.
         """
+        if self.folder.exists() and not self.folder.is_dir():
+            raise NotARunError(
+                f"{self.folder} is no folder, and a run's results lie in one: name an empty or a new folder with --out"
+            )
         # A run that was killed at its begin has left the folder of stamps and no configuration.
-        if self.folder.exists() and not self.was_begun() and {path.name for path in _entries(self.folder)} - {"stages"}:
+        if self.folder.exists() and not self.was_begun() and {path.name for path in self.folder.iterdir()} - {"stages"}:
             raise NotARunError(
                 f"{self.folder} holds other files and is not a run directory, so nothing was written there; name an "
                 "empty or a new folder with --out"
@@ -97,12 +98,20 @@ class RunDirectory:
             file.write(json.dumps(line) + "\n")
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """Yield the lines of ``log.jsonl``, without a line that a kill cut short."""
-        for line in self._log.read_text(encoding="utf-8").splitlines() if self._log.exists() else ():
-            try:
-                yield json.loads(line)
-            except json.JSONDecodeError:
-                continue
+        """Yield the lines of ``log.jsonl``, without lines that are damaged, or that a kill cut short."""
+        for line in self._log.read_bytes().splitlines() if self._log.exists() else ():
+            with suppress(ValueError, RecursionError):
+                event = json.loads(line)
+                if isinstance(event, dict):
+                    yield event
+
+    def at_work(self) -> str:
+        """Return the progress of the running stage, from the last line of the log; empty if it reports none."""
+        last = deque(self.events(), maxlen=1)
+        if last and last[0].get("event") == "progress":
+            what, done, total = (last[0].get(fact) for fact in ("what", "done", "total"))
+            return f"{what}: {done} of {total}"
+        return ""
 
     # ingest
 

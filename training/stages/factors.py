@@ -45,4 +45,5 @@ STAGE = Stage(
     settings=lambda config: [config.factors],
     run=find_factors,
     results=lambda run: [run.factors.path],
+    rewrites=lambda run: [run.modes.path],
 )

@@ -59,5 +59,10 @@ def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
 # A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks
 # that it does not touch.
 STAGE = Stage(
-    name="networks", version=5, settings=_settings, run=train_networks, results=lambda run: [run.histories.path]
+    name="networks",
+    version=5,
+    settings=_settings,
+    run=train_networks,
+    results=lambda run: [run.histories.path],
+    rewrites=lambda run: run.networks(),
 )

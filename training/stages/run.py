@@ -1,6 +1,5 @@
 """The stages of a run in order. Only stages whose settings, input or version have changed are done again."""
 
-import hashlib
 import json
 import shutil
 import time
@@ -26,6 +25,7 @@ from shapespace.training.stages import (  # fmt: skip
     networks,
     samples,
 )
+from shapespace.training.stages.results import LostFile, bundle_fault, file_facts, lost_files, written
 from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
 _MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
@@ -89,24 +89,49 @@ def execute(
 
 def _discard(directory: RunDirectory, path: Path, show: Callable[[str], None]) -> None:
     """Remove a damaged file, and have the stage that wrote it make it again."""
-    path.unlink(missing_ok=True)
-    name = path.relative_to(directory.folder)
-    for stage in STAGES.values():
-        results = stage.results(directory)
-        if path in results or set(path.parents) & set(results):
-            stamp = directory.stamp(stage.name).read_if_written()
-            directory.stamp(stage.name).write({key: value for key, value in stamp.items() if key != "seconds"})
-            show(f"{name}: is damaged and was removed; the stage {stage.name} computes it again")
+    for stage in reversed(STAGES.values()):
+        results, begun = stage.results(directory), directory.stamp(stage.name).exists()
+        if path in results or set(path.parents) & set(results) or (begun and path in stage.rewrites(directory)):
+            _make_again(directory, LostFile(stage.name, path, "damaged"), show)
             return
-    show(f"{name}: is damaged and was removed")
+    path.unlink(missing_ok=True)
+    show(f"{path.relative_to(directory.folder)}: is damaged and was removed")
+
+
+def _make_again(directory: RunDirectory, lost: LostFile, show: Callable[[str], None]) -> None:
+    """Remove a lost file, and mark its stage as not done, with later ones that rewrite files of this stage."""
+    lost.path.unlink(missing_ok=True)
+    results = set(STAGES[lost.stage].results(directory))
+    for name, stage in STAGES.items():
+        stamp = directory.stamp(name).read_if_written()
+        if "seconds" in stamp and (name == lost.stage or results & set(stage.rewrites(directory))):
+            directory.stamp(name).write({key: value for key, value in stamp.items() if key != "seconds"})
+    removed = " and was removed" if lost.why == "damaged" else ""
+    file = lost.path.relative_to(directory.folder)
+    show(f"{file}: is {lost.why}{removed}; the stage {lost.stage} computes it again")
+
+
+def _check_results(run: Run, until: str | None, show: Callable[[str], None]) -> None:
+    """Have the stages up to ``until`` make again what is missing or damaged, and `export` the bundle."""
+    directory, order = run.directory, list(STAGES)
+    for lost in list(lost_files(STAGES.values(), directory)):
+        if until is None or order.index(lost.stage) <= order.index(until):
+            _make_again(directory, lost, show)
+    stamp = directory.stamp("export").read_if_written()
+    if until in (None, "export") and "seconds" in stamp and (why := bundle_fault(run.bundle)):
+        directory.stamp("export").write({key: value for key, value in stamp.items() if key != "seconds"})
+        show(f"{run.bundle}: is {why}; the stage export writes it again")
 
 
 def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, show: Callable[[str], None]) -> bool:
     directory = run.directory
     keys, data = _prepare(run, show)
+    _check_results(run, until, show)
     order = list(STAGES)
     if until in (None, "export") and "seconds" not in directory.stamp("export").read_if_written():
-        require_replaceable(run.bundle)  # before hours of work
+        # before hours of work
+        materials = directory.surface_names.read_if_written().get("materials", ())
+        require_replaceable(run.bundle, [material["texture"] for material in materials])
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
@@ -181,7 +206,7 @@ def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], sho
     else:
         stage.run(run)
     seconds = time.monotonic() - start
-    directory.stamp(name).write(begun | {"seconds": seconds})
+    directory.stamp(name).write(begun | {"seconds": seconds, "files": written(stage, directory)})
     directory.log("end", stage=name, seconds=round(seconds, 3))
     show(f"{name}: {seconds:.0f} s")
 
@@ -195,13 +220,7 @@ def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
     known, found = run.directory.data.read_if_written(), {}
     for path in data_files(source, run.config.collection.file) if source else ():
         name = path.relative_to(source).as_posix() if source and path != source else path.name
-        stat = path.stat()
-        facts = {"bytes": stat.st_size, "time": stat.st_mtime_ns}
-        before = known.get(name, {})
-        if any(before.get(fact) != value for fact, value in facts.items()):
-            with path.open("rb") as file:
-                before = {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
-        found[name] = {**facts, "sha256": before["sha256"]}
+        found[name] = file_facts(path, known.get(name, {}))
     return found
 
 

@@ -121,6 +121,8 @@ class Stage:
     # because a reader would take them for current. Folders of samples are removed when the stage begins, because the
     # change may be taken back until then.
     results: Callable[[RunDirectory], Sequence[Path]]
+    # files that the stage writes too, and that stay where its settings change
+    rewrites: Callable[[RunDirectory], Sequence[Path]] = lambda _: []
     # what the finished stage could not do, read from its files
     warnings: Callable[[RunDirectory], list[StageWarning]] = lambda _: []
     # settings that may change without removing folders, since the stage adds what is missing

@@ -15,7 +15,7 @@ from shapespace.files.archives import zip_pieces
 from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
-from shapespace.files.limits import clipped, label
+from shapespace.files.limits import clipped, label, read_plain
 from shapespace.files.polygon_reading import Lines, joined_lines
 from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
@@ -162,7 +162,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
             opacity = look.pop("opacity", 1.0)
             found[name] = SurfaceMaterial(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
 
-    with Lines(joined_lines(memoryview(path.read_bytes()))) as lines:
+    with Lines(joined_lines(memoryview(read_plain(path)))) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"newmtl":

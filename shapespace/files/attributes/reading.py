@@ -43,6 +43,7 @@ def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
     except OSError:
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
-        reason = str(error) if isinstance(error, MeshError) else f"it can't be understood: {clipped(error, 200)}"
+        what = clipped(error, 200) or "it is damaged"
+        reason = str(error) if isinstance(error, MeshError) else f"it can't be understood: {what}"
         return None, [f"its polygons, texture coordinates and materials are left out: {reason}"]
     return (None if surface.is_plain else surface), faults

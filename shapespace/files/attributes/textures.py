@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
-from shapespace.files.limits import clipped
+from shapespace.files.limits import clipped, read_plain
 
 #: Most bytes of one picture, and of all pictures of a mesh. Every answer in some formats holds all of them.
 LARGEST, ALL = 16 * 2**20, 32 * 2**20
@@ -43,7 +43,7 @@ class Textures:
         def content() -> bytes:
             if path.stat().st_size > LARGEST:
                 raise ValueError(_too_large(path.stat().st_size))
-            return path.read_bytes()
+            return read_plain(path)
 
         return self.add(path.resolve(), path.name, content, material)
 

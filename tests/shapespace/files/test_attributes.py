@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -323,12 +324,18 @@ def test_corners_with_and_without_texture_coordinates_and_normals_go_round(tmp_p
         (["mtllib huge.mtl", "usemtl skin"], PLAIN, "texture huge.png of material skin is left out: it has 16.0 MiB"),
         (["mtllib text.mtl", "usemtl skin"], PLAIN, "texture text.png of material skin is left out: it is neither PNG"),
         (["mtllib odd.mtl", "usemtl skin"], PLAIN, "the materials of odd.mtl are left out: line 2 is 'Kd x'"),
+        (["mtllib zero.mtl", "usemtl skin"], PLAIN, "the materials of zero.mtl are left out: it is a device or a pipe"),
+        (["mtllib pipe.mtl", "usemtl skin"], PLAIN, "the materials of pipe.mtl are left out: it is a device or a pipe"),
+        (["mtllib link.mtl", "usemtl skin"], PLAIN, "link.png of material skin is left out: it is a device or a pipe"),
     ],
 )
 def test_what_can_t_be_kept_is_left_out_with_a_sentence(
     lines: list[str], faces: list[str], says: str, tmp_path: Path
 ) -> None:
-    for name in ("gone", "huge", "text"):
+    os.mkfifo(tmp_path / "pipe.mtl")
+    for name in ("zero.mtl", "link.png"):
+        (tmp_path / name).symlink_to("/dev/zero")
+    for name in ("gone", "huge", "text", "link"):
         (tmp_path / f"{name}.mtl").write_text(f"newmtl skin\nmap_Kd {name}.png\n")
     (tmp_path / "odd.mtl").write_text("newmtl skin\nKd x\n")
     (tmp_path / "huge.png").write_bytes(png() + bytes(LARGEST))

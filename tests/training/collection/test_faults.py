@@ -244,3 +244,18 @@ def test_a_file_whose_name_is_no_text_is_a_fault(tmp_path: Path) -> None:
     (folder / os.fsdecode(b"pose\xff.obj")).touch()
     with pytest.raises(IngestError, match=r"pose\\udcff\.obj: its name is not valid UTF-8; rename it"):
         read_collection(folder)
+
+
+def test_files_that_can_not_be_read_are_listed_with_all_other_faults(tmp_path: Path) -> None:
+    folder = balls(tmp_path / "balls")
+    (folder / "pose1.obj").unlink()
+    (folder / "pose1.obj").symlink_to("/proc/self/mem")  # may be opened, but not read
+    (folder / "pose2.obj").write_bytes(b"")
+    assert {"pose1.obj", "pose2.obj"} <= {Path(name).name for name in faults(folder)}
+
+
+def test_a_pattern_with_several_files_in_every_folder_is_called_that(tmp_path: Path) -> None:
+    for subject in ("a", "b", "c"):
+        balls(tmp_path / "subjects" / subject, count=2)
+    with pytest.raises(IngestError, match=r"has 2 files \*\.obj"):
+        read_collection(tmp_path / "subjects", file="*.obj")

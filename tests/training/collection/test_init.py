@@ -143,3 +143,16 @@ def test_the_command_says_what_comes_next(
     assert run(monkeypatch, "init", folder, "--force", "--out", "other.toml") == 0
     assert run(monkeypatch, "init", tmp_path / "none") == 1
     assert capsys.readouterr().err == f"shapespace-train: {tmp_path / 'none'}: no such file or folder\n"
+
+
+def test_an_empty_path_is_refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run(monkeypatch, "init", "")
+    assert "it is empty; name a file or folder" in capsys.readouterr().err
+
+
+def test_help_names_all_that_can_be_read(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run(monkeypatch, "init", "--help")
+    said = " ".join(capsys.readouterr().out.split())
+    assert all(word in said for word in ("VTK", "morph targets", "folder for each subject"))

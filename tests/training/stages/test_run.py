@@ -23,10 +23,10 @@ def test_no_stage_of_a_run_of_version_0_2_is_done_again(name: str, tmp_path: Pat
     for stage, stamp in STAMPS[name].items():
         directory.stamp(stage).write(stamp)
     run = Run(tmp_path, *load(RUNS / name / "config.toml"), tmp_path / "models")
-    assert not execute(run, show=said.append)
+    assert not execute(run, "evaluation", show=said.append)  # there is no bundle
     assert said[0].startswith("networks.seeds")
     assert "python -m benchmarks.studies" in said[0]
-    assert said[1:] == [f"{stage}: done before (1 s)" for stage in STAGES]
+    assert said[1:] == [f"{stage}: done before (1 s)" for stage in list(STAGES)[:-1]]
     assert [directory.stamp(stage).read() for stage in STAGES] == list(STAMPS[name].values())
 
 

@@ -50,6 +50,7 @@ def test_a_folder_with_other_files_is_left_alone(name: str, config: Path, tmp_pa
 def test_a_file_in_place_of_the_folder_is_left_alone(config: Path, tmp_path: Path, said: Said) -> None:
     (tmp_path / "mine").write_text("mine")
     said("run", config, "--out", tmp_path / "mine", code=1)
+    assert "mine is no folder" in said.errors
     assert (tmp_path / "mine").read_text() == "mine"
 
 
@@ -91,6 +92,13 @@ def test_devices_are_no_collections(tmp_path: Path, said: Said) -> None:
     assert "pipe.obj: can't be read" in said.errors
 
 
+def test_devices_and_pipes_are_no_configurations(tmp_path: Path, said: Said) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    for place in ("/dev/zero", tmp_path / "pipe.toml"):
+        said("run", place, code=1)
+        assert f"{place}: can't be read: it is a device or a pipe" in said.errors
+
+
 def flip(path: Path, place: int) -> None:
     content = bytearray(path.read_bytes())
     content[place] ^= 1
@@ -117,7 +125,7 @@ def test_a_damaged_file_is_told_from_one_that_is_missing(tmp_path: Path) -> None
     with pytest.raises(FileNotFoundError):
         JsonFile(path).read()
     path.write_text("{")
-    with pytest.raises(DamagedFileError, match=r"x\.json is damaged; run the same command again"):
+    with pytest.raises(DamagedFileError, match=r"x\.json is damaged; give the command run"):
         JsonFile(path).read()
     with pytest.raises(NotARunError):
         RunDirectory(tmp_path).begin()
@@ -157,3 +165,62 @@ def test_a_signal_ends_the_run_with_a_sentence_and_all_its_processes(
     while processes(process.pid):  # ends by the tests' own limit, if ever
         time.sleep(0.01)
     shutil.rmtree(out)
+
+
+@pytest.fixture
+def finished(tiny_run: Path, tmp_path: Path) -> Path:
+    """A copy of the shared run and its bundle, beside its configuration."""
+    shutil.copytree(tiny_run, tmp_path / "out")
+    return tmp_path / "out"
+
+
+#: Files of a finished run, and the stage that makes each.
+RESULTS = {
+    "reference.npz": "ingest",
+    "factors.json": "factors",
+    "samples/split.npz": "samples",
+    "samples/factor-1/part-00000.npz": "samples",
+    "networks/histories.json": "networks",
+    "networks/monolithic-*.safetensors": "networks",
+    "exact/fresh/part-00000.npz": "evaluation",
+    "gallery.npz": "evaluation",
+}
+
+
+@pytest.mark.parametrize("why", ["damaged", "missing"])
+def test_a_finished_run_makes_again_what_is_damaged_or_missing(
+    why: str, config: Path, finished: Path, said: Said
+) -> None:
+    before = {next(finished.glob(name)): stage for name, stage in RESULTS.items()}
+    contents_before = {path: path.read_bytes() for path in before}
+    for path in before:
+        flip(path, path.stat().st_size // 2) if why == "damaged" else path.unlink()
+    run = "run", config, "--out", finished, "--models", finished / "models", "--until", "evaluation"
+    status, words = said("status", finished), said(*run)
+    for path, stage in before.items():
+        name, removed = path.relative_to(finished), " and was removed" if why == "damaged" else ""
+        assert f"{name} is {why}" in next(line for line in status.splitlines() if line.startswith(f"{stage} "))
+        assert f"{name}: is {why}{removed}; the stage {stage} computes it again" in words
+        if path.suffix == ".npz":
+            assert path.read_bytes() == contents_before[path]
+    assert "mean: done before" in words
+    assert "again" not in said("status", finished) + said(*run)
+
+
+@pytest.mark.parametrize("why", ["damaged", "missing"])
+def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished: Path, said: Said) -> None:
+    models = finished / "models"
+    bundle = models / "tiny-torus" / "1"
+    before = contents(bundle)
+    if why == "damaged":
+        (bundle / "manifest.json").write_text("{")
+    else:
+        shutil.rmtree(models)
+    assert f"{bundle}: is {why}; the stage export writes it again" in said("export", finished, "--models", models)
+    assert contents(bundle) == before
+
+
+def test_a_damaged_log_is_no_obstacle(finished: Path, said: Said) -> None:
+    (finished / "log.jsonl").write_bytes(b'\xff\xfe{"event": 1}\n[1]\n{"event": "progress"}\n')
+    assert "done in" in said("status", finished)
+    said("report", finished)

@@ -381,6 +381,22 @@ def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stag
     assert after["evaluation"] > after["export"] == 0
 
 
+def test_modes_that_are_lost_are_found_again_and_put_in_the_order_of_the_factors(
+    copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = copy.directory
+    paths = [directory.mean.path, directory.modes.path, directory.modes_by_strength.path]
+    before, times = [path.read_bytes() for path in paths], seconds(copy)
+    paths[1].unlink()
+    again(copy, monkeypatch, until="factors")
+    assert seconds(copy)["modes"] == times["modes"], "the factors alone write them again"
+    for path in paths:
+        path.unlink()
+    again(copy, monkeypatch, until="evaluation")
+    assert [path.read_bytes() for path in paths] == before
+    assert seconds(copy)["samples"] == times["samples"]
+
+
 @pytest.mark.long
 def test_a_description_changes_the_bundle_alone(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     before, name = seconds(copy), copy.directory.factors.read()["names"][0]
