@@ -49,6 +49,6 @@ def test_a_setting_is_read_by_its_stage_and_none_before(section: str, setting: s
 
 
 def test_each_stage_has_one_file() -> None:
-    files = {path.stem for path in Path(stages.__path__[0]).glob("*.py")} - {"__init__", "run", "stage"}
+    files = {path.stem for path in Path(stages.__path__[0]).glob("*.py")} - {"__init__", "results", "run", "stage"}
     assert files == STAGES.keys()
     assert list(STAMPS["figure"]) == list(STAGES)
