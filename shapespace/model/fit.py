@@ -35,16 +35,14 @@ class ScanFitSettings:
     """Sizes and thresholds of a fit. Distances are fractions of the reference's diagonal.
 
     Attributes:
-        start_shapes: number of start shapes, chosen as far apart as possible,
-        random_shapes: from this number of random shapes.
+        start_shapes, random_shapes: number of start shapes, chosen as far apart as possible from random shapes.
         shape_points: number of points of a start shape that are compared with the scan.
         coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
         rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
         behind: in the last round, a second start takes part if it costs at most this multiple of the best.
         middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
-        again_steps: steps with few points that pull unmatched parts together, if the result is poor.
-        attempts: attempts to move a limb of the model to an unmatched limb of the scan,
-        attempt_steps: with this number of iterations each,
+        again_steps: further steps with few points if the result is poor.
+        attempts, attempt_steps: attempts to move a limb of the model to one of the scan, and the iterations of each,
         drawn_steps: of which this number pulls the limb by target points.
         units, units_of_part: a scan (of a part) that is this many times larger or smaller than the model's shapes is
             taken to be in other units, unless the scale is free.
@@ -383,10 +381,8 @@ class _Fit:
             status = FitStatus.DEADLINE
             reason = f"The time ended before the fit converged: {shares} so far. Send fewer points or a coarser scan."
         elif self._is_poor(explained, seen):
-            status, reason = (
-                FitStatus.POOR,
-                (f"Only {shares}: the scan is not a shape of this model, or the search failed."),
-            )
+            status = FitStatus.POOR
+            reason = f"Only {shares}: the scan is not a shape of this model, or the search failed."
             if mirrored is not None and mirrored < SETTINGS.mirrored:
                 reason += " Its mirror image fits much better: change the sign of one coordinate."
             elif not self.constraints.partial:
