@@ -295,10 +295,8 @@ class _Fit:
             if begun is None:
                 continue
             rival = search.run(begun, SETTINGS.last_steps - 1, first=False)
-            if (
-                self._apart(rival, final) > SETTINGS.elsewhere
-                and rival.cost <= SETTINGS.nearly * final.cost + SETTINGS.beside
-            ):
+            as_good = rival.cost <= SETTINGS.nearly * final.cost + SETTINGS.beside
+            if as_good and self._apart(rival, final) > SETTINGS.elsewhere:
                 return (rival, final) if rival.cost < final.cost else (final, rival)
         return final, None
 
