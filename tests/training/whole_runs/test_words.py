@@ -21,6 +21,7 @@ from shapespace.training.commands import HOME
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.stages.results import remember
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.faults.training import CONFIG, bars
@@ -285,6 +286,7 @@ def test_lost_logarithms_are_said_and_stop_the_run(place: Path, said: Said) -> N
         ([4, 0, 4, 0, 4], "for 2 of 5 shapes no geodesic was found, so a straight line replaces it: bar1, bar3", True),
     ):
         (run / "modes.json").write_text(json.dumps(modes | {"steps": steps, "log_steps": 4, "asked": 9}))
+        remember(STAGES["modes"], RunDirectory(run))
         words = said("run", "bars.toml", "--until", "factors", code=int(stops))
         assert f"  {says}\n" in words
         assert "  found 2 of 9 modes, because the others would be zero" in words
@@ -323,7 +325,9 @@ def test_failed_samples_are_counted_by_factor(place: Path) -> None:
 
 def test_a_traceback_is_written_and_not_shown(place: Path, said: Said) -> None:
     said("run", "bars.toml", "--until", "ingest")
-    np.savez(place / "runs" / "bars" / "shapes.npz", other=np.zeros(1))  # what no run writes
+    run = place / "runs" / "bars"
+    np.savez(run / "shapes.npz", other=np.zeros(1))  # what no run writes
+    remember(STAGES["ingest"], RunDirectory(run))
     done = subprocess.run(
         [sys.executable, "-m", "shapespace.training", "run", "bars.toml"],
         capture_output=True,
