@@ -37,7 +37,7 @@ def face_file(path: Path, targets: int = 2) -> Path:
         }
         for name, shapes in (("Head", head), ("Eye", eye))
     ]
-    file.tree["nodes"] = [{"mesh": 1, "name": "Eye"}, {"mesh": 0, "name": "Head"}]
+    file.tree["nodes"] = [{"mesh": 0, "name": "Head"}, {"mesh": 1, "name": "Eye"}]
     file.tree["scenes"] = [{"nodes": [0, 1]}]
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(file.bytes())

@@ -44,7 +44,7 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
         find_mean(run)
     faces = mesh.faces[[{i, j} <= set(face) for face in mesh.faces]]
     places = [
-        f"one of two.obj at its vertex {2 * v + 1 + 5 + 1} (counted from 1), at ({x:.6g}, {y:.6g}, {z:.6g}), "
+        f"is in two.obj, at its vertex {2 * v + 1 + 5 + 1} (counted from 1), at ({x:.6g}, {y:.6g}, {z:.6g}). "
         for v, (x, y, z) in ((v, 10 * shapes[1, v]) for v in faces.ravel())
     ]
     assert sum(place in str(error.value) for place in places) >= 1
