@@ -103,12 +103,18 @@ def _make_again(directory: RunDirectory, lost: LostFile, show: Callable[[str], N
     lost.path.unlink(missing_ok=True)
     results = set(STAGES[lost.stage].results(directory))
     for name, stage in STAGES.items():
-        stamp = directory.stamp(name).read_if_written()
-        if "seconds" in stamp and (name == lost.stage or results & set(stage.rewrites(directory))):
-            directory.stamp(name).write({key: value for key, value in stamp.items() if key != "seconds"})
+        if name == lost.stage or results & set(stage.rewrites(directory)):
+            _mark_undone(directory, name)
     removed = " and was removed" if lost.why == "damaged" else ""
     file = lost.path.relative_to(directory.folder)
     show(f"{file}: is {lost.why}{removed}; the stage {lost.stage} computes it again")
+
+
+def _mark_undone(directory: RunDirectory, name: str) -> None:
+    """Take a finished stage for one that was interrupted, so that it begins again."""
+    stamp = directory.stamp(name).read_if_written()
+    if stamp.pop("seconds", None) is not None:
+        directory.stamp(name).write(stamp)
 
 
 def _check_results(run: Run, until: str | None, show: Callable[[str], None]) -> None:
@@ -117,9 +123,9 @@ def _check_results(run: Run, until: str | None, show: Callable[[str], None]) -> 
     for lost in list(lost_files(STAGES.values(), directory)):
         if until is None or order.index(lost.stage) <= order.index(until):
             _make_again(directory, lost, show)
-    stamp = directory.stamp("export").read_if_written()
-    if until in (None, "export") and "seconds" in stamp and (why := bundle_fault(run.bundle)):
-        directory.stamp("export").write({key: value for key, value in stamp.items() if key != "seconds"})
+    exported = "seconds" in directory.stamp("export").read_if_written()
+    if until in (None, "export") and exported and (why := bundle_fault(run.bundle)):
+        _mark_undone(directory, "export")
         show(f"{run.bundle}: is {why}; the stage export writes it again")
 
 
@@ -219,7 +225,7 @@ def _data_facts(run: Run) -> dict[str, dict[str, Any]]:
     source = run.config.collection.data
     known, found = run.directory.data.read_if_written(), {}
     for path in data_files(source, run.config.collection.file) if source else ():
-        name = path.relative_to(source).as_posix() if source and path != source else path.name
+        name = path.relative_to(source).as_posix() if source and source.is_dir() else path.name
         found[name] = file_facts(path, known.get(name, {}))
     return found
 

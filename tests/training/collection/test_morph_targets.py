@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.config import load
 from tests.shapespace.files.test_gltf_pose import File
 from tests.training.collection.test_ingest import FACES, SHAPES
+from tests.training.conftest import Said
 
 
 def face_file(path: Path, targets: int = 2) -> Path:
@@ -80,6 +82,19 @@ def test_buffers_beside_a_file_belong_to_the_collection(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"")
     assert [p.name for p in data_files(tmp_path / "face.gltf")] == ["face.gltf", "face.bin", "skin.png"]
     assert [p.name for p in data_files(tmp_path / "face.txt")] == ["face.txt"]
+
+
+def test_a_run_reads_a_file_with_buffers_beside_it(tmp_path: Path, said: Said) -> None:
+    data = face_file(tmp_path / "face.glb").read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + size])
+    tree["buffers"][0]["uri"] = "face.bin"
+    (tmp_path / "face.gltf").write_text(json.dumps(tree))
+    (tmp_path / "face.bin").write_bytes(data[28 + size :])
+    said("init", tmp_path / "face.gltf", "--out", tmp_path / "face.toml")
+    run = "run", tmp_path / "face.toml", "--out", tmp_path / "run", "--until", "ingest"
+    said(*run)
+    assert "ingest: done before" in said(*run)
 
 
 @pytest.mark.parametrize("targets", [0, 1])
