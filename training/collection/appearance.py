@@ -10,7 +10,7 @@ from shapespace.files.attributes.reading import FORMATS, read_attributes
 from shapespace.files.limits import in_words
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.training.collection.listing import data_files
+from shapespace.training.collection.listing import data_files, extension
 from shapespace.training.collection.mesh_collection import MeshCollection
 
 
@@ -28,7 +28,7 @@ def reference_surface(
         return None, []
     names = [name for name, _ in (meshes.places[chosen], *meshes.places)]
     paths = [data / name for name in names] if data.is_dir() else []
-    path = next((path for path in (*paths, *data_files(data)) if path.suffix.lstrip(".").lower() in FORMATS), None)
+    path = next((path for path in (*paths, *data_files(data)) if extension(path) in FORMATS), None)
     if path is None:
         return None, []
     try:

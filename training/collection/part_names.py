@@ -11,11 +11,12 @@ import numpy as np
 from shapespace.arrays import IntArray
 from shapespace.files.attributes.reading import FORMATS, read_attributes
 from shapespace.mesh.attributes import Labels, MeshAttributes
+from shapespace.training.collection.listing import extension
 
 
 def may_have_names(path: Path) -> bool:
     """Whether the format of a file can name parts."""
-    return path.suffix.lstrip(".").lower() in FORMATS
+    return extension(path) in FORMATS
 
 
 def part_names(parts: Sequence[IntArray], path: Path | None) -> list[str]:
