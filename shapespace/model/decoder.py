@@ -235,7 +235,7 @@ class Decoder:
     def lengths_and_angles(self, code: Codes) -> tuple[FloatArray, FloatArray]:
         """Return edge lengths and dihedral angles in radians (2E,) that the networks predict for a code (m,).
 
-        Also return those of each factor (J, 2E). Lengths are in the user's units. Raises NotFiniteError.
+        Also return each factor's lengths and angles (J, 2E). Lengths are in the user's units. Raises NotFiniteError.
         """
         factors, z = (array[0].astype(np.float64) for array in self._networks(code[None]))
         half = self.manifest.edges

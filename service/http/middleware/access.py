@@ -78,8 +78,8 @@ class RequireHost(HTTPMiddleware):
 class RequireKey(HTTPMiddleware):
     """Refuses requests without the key, in ``Authorization: Bearer`` or ``X-API-Key``.
 
-    Answers to wrong keys wait, the right key never does. So nobody can keep the clients of a shared address out. What
-    prevents guesses is the length of the key.
+    Answers to wrong keys wait, the right key never does. So wrong keys cannot lock out the other clients of an
+    address. What prevents guesses is the length of the key.
     """
 
     def __init__(self, app: ASGIApp, key: SecretStr) -> None:
