@@ -47,8 +47,9 @@ def serve(unknown: Sequence[str]) -> None:
 def _serve(validator: BundleValidator) -> None:
     from pydantic import ValidationError
 
+    from shapespace.bundle.finding import BUNDLED
     from shapespace.service.repository.validation import bundle_folders
-    from shapespace.service.settings import BUNDLED, PREFIX, Settings, is_loopback, unknown_variables
+    from shapespace.service.settings import PREFIX, Settings, is_loopback, unknown_variables
 
     try:
         settings = Settings()

@@ -65,6 +65,12 @@ class Distribution(StrEnum):
     POPULATION = "population"
 
 
+def _read_only(values: Sequence[float]) -> FloatArray:
+    array = np.array(values)
+    array.setflags(write=False)
+    return array
+
+
 class LatentSpace:
     """Coordinates of a model's codes, with their bounds and periods.
 
@@ -75,7 +81,7 @@ class LatentSpace:
     def __init__(self, manifest: Manifest) -> None:
         self.model = manifest.name
         self.names = manifest.latent_names
-        self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
+        self.lower, self.upper = _read_only(manifest.lower), _read_only(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
         # Rounded like codes, so that a bound itself always counts as inside.
