@@ -97,6 +97,7 @@ COMMAND = Subcommand(
     # All that is unknown together, so that the message names all of it.
     params=[click.Argument(["unknown"], nargs=-1, type=click.UNPROCESSED, metavar="")],
     context_settings={"ignore_unknown_options": True},
+    examples=[""],
     needs=NEEDED,
     extra="serve",
     advice="Settings are environment variables, as in: SHAPESPACE_HOST=127.0.0.1 SHAPESPACE_PORT=8001 shapespace serve",

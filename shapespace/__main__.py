@@ -6,6 +6,7 @@ import sys
 from contextlib import suppress
 
 from shapespace.command_line import Program, call
+from shapespace.commands import COMMANDS
 from shapespace.service.__main__ import COMMAND as SERVE
 
 _TRAINING = ()
@@ -13,7 +14,7 @@ with suppress(ModuleNotFoundError):  # an installation may leave training out
     from shapespace.training.__main__ import COMMANDS as _TRAINING
 
 PROGRAM = Program(
-    [SERVE, *_TRAINING],
+    [*COMMANDS, SERVE, *_TRAINING],
     help="Turn a few numbers into a 3D shape: use a model, train your own, or serve models.",
 )
 

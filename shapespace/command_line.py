@@ -10,6 +10,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import pairwise
@@ -79,6 +80,7 @@ class Subcommand(click.Command):
             is imported when the command runs.
         needs: modules that the command needs, beside the modules of `shapespace` itself.
         extra: extra of the distribution that installs them.
+        late_params: place MODULE:NAME of further parameters, which need these packages.
         examples: arguments after the name of the command.
         advice: ends the message about an argument that is refused.
         options: of click.
@@ -93,6 +95,7 @@ class Subcommand(click.Command):
         *,
         needs: Sequence[str] = (),
         extra: str = "",
+        late_params: str = "",
         examples: Sequence[str] = (),
         advice: str = "",
         params: Sequence[click.Parameter] = (),
@@ -106,10 +109,21 @@ class Subcommand(click.Command):
             context_settings={**_SETTINGS, **context_settings},
             **options,
         )
-        self.needs, self.extra, self.examples, self.advice = needs, extra, examples, advice
+        self._missing = partial(missing_packages, needs, extra)
+        self._late, self._examples, self.advice = late_params, examples, advice
+
+    @cached_property
+    def _further(self) -> list[click.Parameter]:
+        return [*_imported(self._late)] if self._late and not self._missing() else []
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return all parameters."""
+        return [*self._further, *super().get_params(ctx)]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the arguments, in which an option may have several values."""
+        """Read the arguments, or say which packages the command lacks. An option may have several values."""
+        if not ({"-h", "--help", "--version"} & {*args} or ctx.resilient_parsing) and (sentence := self._missing()):
+            ctx.exit(fail(sentence, USAGE))
         options = [each for each in self.get_params(ctx) if isinstance(each, click.Option)]
         names = {name for option in options for name in option.opts}
         valued = {name for option in options if not option.is_flag for name in option.opts}
@@ -119,23 +133,16 @@ class Subcommand(click.Command):
         several = {name for option in options if isinstance(option, Several) for name in option.opts}
         return super().parse_args(ctx, [*_one_value_each(args, several)])
 
-    def invoke(self, ctx: click.Context) -> Any:
-        """Do the work, or say which packages are missing."""
-        if sentence := self.missing():
-            return fail(sentence, USAGE)
-        return super().invoke(ctx)
-
-    def missing(self) -> str:
-        """Return a sentence about packages that aren't installed; empty if all are there."""
-        return missing_packages(self.needs, self.extra)
-
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the examples."""
+        """Write the examples, and which packages are missing."""
         super().format_epilog(ctx, formatter)
-        if self.examples:
+        if self._examples:
             with formatter.section("Examples"):
-                for example in self.examples:
-                    formatter.write(f"{'':{formatter.current_indent}}{ctx.command_path} {example}\n")
+                for example in self._examples:
+                    formatter.write(f"{'':{formatter.current_indent}}{ctx.command_path} {example}".rstrip() + "\n")
+        if sentence := self._missing():
+            formatter.write_paragraph()
+            formatter.write_text(f"The command {sentence}")
 
 
 class Program(click.Group):
@@ -254,8 +261,16 @@ def _is_installed(module: str) -> bool:
 
 def _imported_late(place: str) -> Callable[..., Any]:
     """Return a function that imports the function MODULE:NAME when it is called."""
+
+    def late(**parameters: Any) -> Any:
+        return _imported(place)(**parameters)
+
+    return late
+
+
+def _imported(place: str) -> Any:
     module, _, name = place.partition(":")
-    return lambda **parameters: getattr(import_module(module), name)(**parameters)
+    return getattr(import_module(module), name)
 
 
 def _one_value_each(arguments: Sequence[str], several: set[str]) -> Iterator[str]:

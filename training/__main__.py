@@ -20,8 +20,8 @@ NEEDED = (
 )  # fmt: skip
 #: What ``init`` reads.
 _MESHES = (
-    "MESH_DIR is a folder of OBJ, PLY, STL, OFF, glTF or VTK files; or one NPZ file with all shapes; or one GLB or glTF file "
-    "whose morph targets are the shapes; or, with --file, a folder that has a folder for each subject."
+    "MESH_DIR is a folder of OBJ, PLY, STL, OFF, glTF or VTK files; or one NPZ file with all shapes; or one GLB or "
+    "glTF file whose morph targets are the shapes; or, with --file, a folder that has a folder for each subject."
 )
 _SUBJECTS = "read this file from each folder in MESH_DIR, for data with one folder per subject; may have * and ?"
 _UNTIL = f"stop after this stage: {', '.join(STAGE_NAMES)}"

@@ -8,13 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import shapespace
 from shapespace.bundle.reader import BundleError, read_manifest
 from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN
 from shapespace.files.limits import in_words
 
 #: Folder of the models that are installed with the package.
-BUNDLED = Path(shapespace.__file__).parent / "models"
+BUNDLED = Path(__file__).parents[1] / "models"
 
 
 @dataclass(frozen=True)

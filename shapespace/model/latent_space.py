@@ -132,7 +132,7 @@ class LatentSpace:
             i, k = np.argwhere(outside)[0]
             raise OutOfBoundsError(
                 f"Coordinate {k} ({self.names[k]}) of code {i} is {x[i, k]:g}, outside "
-                f'[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
+                f"[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or choose clamp or allow for bounds."
             )
         # Adding zero turns −0 into 0, so that a shape has only one code.
         inside = np.logical_not(outside.any(axis=1))

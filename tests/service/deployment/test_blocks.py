@@ -17,11 +17,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import httpx
 import pytest
 
-from shapespace.service.settings import PREFIX, Settings
 from shapespace.__main__ import PROGRAM
+from shapespace.command_line import Subcommand
+from shapespace.service.settings import PREFIX, Settings
 from tests.long.__main__ import TESTS
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting

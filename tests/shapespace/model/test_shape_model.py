@@ -157,9 +157,7 @@ def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) 
             load(folder)
 
 
-def test_models_are_known_by_name_in_any_folder(
-    models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert {"figure", "freaky-torus"} <= shapespace.models().keys()
     assert load("figure").folder == BUNDLED / "figure" / "3"
@@ -191,10 +189,10 @@ def test_a_model_is_sent_to_another_process_by_its_folder(models: Path, tmp_path
         np.testing.assert_array_equal(pool.submit(model.decode, CODES).result(), model.decode(CODES))
     write_bundle(tmp_path, "small", "2", fine=True)
     with pytest.raises(BundleError, match="has changed since the model was pickled"):
-        pickle.loads(content)
+        pickle.loads(content)  # noqa: S301
     shutil.rmtree(tmp_path / "small")
     with pytest.raises(BundleError, match="can't be read"):
-        pickle.loads(content)
+        pickle.loads(content)  # noqa: S301
 
 
 def test_bounds_are_read_only(model: ShapeModel) -> None:
