@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 from contextlib import suppress
 
-from shapespace.command_line import Program, call
+from shapespace.command_line import Program, Subcommand, call
 from shapespace.commands import COMMANDS
 from shapespace.service.__main__ import COMMAND as SERVE
 
-_TRAINING = ()
+_TRAINING: tuple[Subcommand, ...] = ()
 with suppress(ModuleNotFoundError):  # an installation may leave training out
     from shapespace.training.__main__ import COMMANDS as _TRAINING
 

@@ -131,7 +131,11 @@ class Subcommand(click.Command):
             if name in valued and value in names:
                 ctx.fail(f"Option {name!r} requires an argument.")
         several = {name for option in options if isinstance(option, Several) for name in option.opts}
-        return super().parse_args(ctx, [*_one_value_each(args, several)])
+        try:
+            return super().parse_args(ctx, [*_one_value_each(args, several)])
+        except click.UsageError as error:
+            error.ctx = error.ctx or ctx  # some errors of the parser have none
+            raise
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples, and which packages are missing."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from shapespace.bundle.geometry import Geometry, GeometryError
-from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
+from shapespace.bundle.schema import CARD, MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
 from shapespace.files.npz import npz_headers, read_npz
 
 #: Most bytes of a manifest.
@@ -68,6 +68,7 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     if digest not in (None, found):
         raise BundleError("its files changed while the server tested it")
     files = read_files(folder, manifest)
+    files.pop(CARD, None)
     textures = {file: files.pop(file) for file in (manifest.surface.textures if manifest.surface else ())}
     geometry = _geometry(files.pop(manifest.geometry.file), manifest, textures)
     for file, content in files.items():

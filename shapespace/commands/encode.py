@@ -49,7 +49,7 @@ def encode(model: str, files: Sequence[Path], table: Path, force: bool, **parame
                 found = loaded.encode(path, options)
             except REFUSED as error:
                 refused += 1
-                row = [NO_MESH, str(error), "", "", "", *[""] * loaded.dimension]
+                row: list[Any] = [NO_MESH, str(error), "", "", "", *[""] * loaded.dimension]
             else:
                 errors = [float(found.distances.mean()), float(found.distances.max())]
                 row = [found.status, found.reason, *errors, found.inside_bounds, *found.code.astype(str)]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from shapespace.bundle import finding
-from shapespace.command_line import fail
-from shapespace.commands.parameters import command
+from shapespace.command_line import carry_out, fail
 
 PARAMS = ()
 _HEAD = ("name", "version", "numbers", "licence", "title")
 
 
-@command
 def models() -> int:
-    """Print a line for each model, with the numbers in its code."""
+    """Print a line for each model, with the numbers in its code; return 0 if there is one."""
+    return carry_out(_print_table, ())
+
+
+def _print_table() -> int:
     found = finding.models().values()
     rows = [(each.name, each.version, str(each.dimension), each.licence, each.title) for each in found]
     if not rows:
