@@ -105,7 +105,7 @@ COMMAND = Subcommand(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve; the arguments are by default those that the program was called with."""
+    """Serve, with the arguments of the program by default."""
     return call("shapespace-serve", COMMAND, arguments)
 
 
