@@ -118,17 +118,17 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
         files |= geometry.surface.textures
     folder = models / facts.name / facts.version
     require_replaceable(folder, files)
-    _write(folder, _manifest(facts, geometry, files), files, geometry)
+    _replace(folder, files, _manifest(facts, geometry, files), geometry)
     return folder
 
 
 def add_card(folder: Path) -> None:
     """Write the card of a bundle that has none, or whose manifest has changed; raises BundleError or OSError."""
     bundle = read_bundle(folder)
-    _write(folder, bundle.manifest, read_files(folder, bundle.manifest), bundle)
+    _replace(folder, read_files(folder, bundle.manifest), bundle.manifest, bundle)
 
 
-def _write(folder: Path, manifest: Manifest, files: Mapping[str, bytes], geometry: Geometry) -> None:
+def _replace(folder: Path, files: Mapping[str, bytes], manifest: Manifest, geometry: Geometry) -> None:
     """Write or replace a bundle, with its card."""
     files = {**files, CARD: card(manifest, geometry)}
     entries = {name: entry(files[name]) for name in sorted(files)}

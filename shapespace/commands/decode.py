@@ -50,7 +50,7 @@ PARAMS = (
         ["--latent"], type=_CodeType(), multiple=True, metavar="A,B,…",
         help="a code, with one number for each coordinate; may be given several times",
     ),
-    click.Option(["--random"], type=click.IntRange(1), metavar="N", help="number of random codes"),
+    click.Option(["--random"], type=click.IntRange(1, 1_000_000), metavar="N", help="number of random codes"),
     click.Option(
         ["--seed"], type=click.IntRange(0), default=0, show_default=True, metavar="S",
         help="seed of the random codes; the same seed gives the same codes",

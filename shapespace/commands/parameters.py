@@ -136,6 +136,13 @@ def require_new(paths: Iterable[Path], *, force: bool) -> None:
             raise UnusableOutputError(f"{path}: exists already; {remedy}")
 
 
+def format_of(path: Path) -> str:
+    """Return the format that the extension of a file names, GLB for standard output; raises UnusableOutputError."""
+    if path != STANDARD and not path.suffix:
+        raise UnusableOutputError(f"{path} has no extension, which tells the format: add .glb or another one")
+    return require_writable(path.suffix[1:] or "glb")
+
+
 def require_writable(format: str) -> str:
     """Return the name of a format in small letters; raises UnusableOutputError if it can't be written."""
     name = format.lower()
