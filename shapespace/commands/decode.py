@@ -20,6 +20,7 @@ from shapespace.commands.parameters import (
     UnusableOutputError,
     choice,
     command,
+    format_of,
     require_new,
     require_writable,
     write,
@@ -123,11 +124,12 @@ def decode(
 
 def _kind_of(out: Path, format: str | None) -> tuple[str, bool]:
     """Return the format of files, and whether they go into a folder; raises UnusableOutputError."""
-    extension = out.suffix[1:].lower()
-    is_folder = out != STANDARD and (out.is_dir() or not extension)
-    if not is_folder and format is None and extension:
-        format = extension
-    return require_writable(format or "glb"), is_folder
+    is_folder = out != STANDARD and (out.is_dir() or not out.suffix)
+    if is_folder and out.exists() and not out.is_dir():
+        raise UnusableOutputError(f"{out} is a file; name a folder, or a file with an extension such as .glb")
+    if format:
+        return require_writable(format), is_folder
+    return ("glb" if is_folder else format_of(out)), is_folder
 
 
 def _table(names: Sequence[str], files: Sequence[str], codes: Codes) -> bytes:

@@ -19,9 +19,9 @@ from shapespace.commands.parameters import (
     STANDARD,
     chosen,
     command,
+    format_of,
     options_of,
     require_new,
-    require_writable,
     write,
 )  # fmt: skip
 from shapespace.model.decoder import MeshChoice
@@ -58,7 +58,7 @@ def fit(
 ) -> None:
     """Write the fitted shape and the results, and say how the fit ended."""
     require_new([path for path in (out, answer) if path], force=force)
-    format = require_writable(out.suffix[1:] or "glb") if out else ""
+    format = format_of(out) if out else ""
     loaded = load(model)
     limit = None if deadline is None else Deadline(seconds=deadline)
     found = loaded.fit_scan(scan, chosen(FitOptions, parameters), deadline=limit)

@@ -25,6 +25,7 @@ CODE = "0.1,0.7,0.4"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("commands")
     write_bundle(place / "models", "small", fine=True)
+    (place / "plain").write_text("kept")
     return place
 
 
@@ -172,6 +173,10 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
         ("decode none/small --out x.glb", 1, "none/small can't be read: there is no such file or folder"),
         ("decode small --random 2 --out x.glb", 1, "x.glb is one file; for several shapes, name a folder, such as x"),
         ("decode small --out x.xyz", 1, "there is no format 'xyz'; choose among glb, gltf, obj"),
+        ("decode small --out models/small/1/README.md", 1, "there is no format 'md'"),
+        ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
+        ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
+        ("fit small a.ply --json plain", 1, "plain: exists already"),
         ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3"),
         ("decode small --latent 9,0,0 --bounds reject --out x.glb", 1, "Move it inside"),
         ("decode small --latent 1,x,2 --out x.glb", 2, "is not a list of numbers"),
