@@ -159,7 +159,7 @@ class Manifest(_Strict):
         named += self.surface.textures if self.surface else []
         named += [CARD] if CARD in self.files else []
         if sorted(named) != sorted(self.files):
-            raise ValueError("files must list exactly the networks, the geometry, the textures and the card")
+            raise ValueError("files must list exactly the networks, the geometry and the textures")
         return self
 
 

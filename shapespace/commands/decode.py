@@ -24,7 +24,7 @@ from shapespace.commands.parameters import (
     require_new,
     require_writable,
     write,
-)  # fmt: skip
+)
 from shapespace.model.decoder import MeshChoice, Quality
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape_model import load

@@ -23,7 +23,7 @@ from shapespace.commands.parameters import (
     options_of,
     require_new,
     write,
-)  # fmt: skip
+)
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.options import FitOptions
 from shapespace.model.shape_model import load
