@@ -169,7 +169,7 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        ("decode smal --out x.glb", 1, "no model smal here: choose among figure, freaky-torus, small, or name"),
+        ("decode smaller --out x.glb", 1, "no model smaller here: choose among figure, freaky-torus, small, or name"),
         ("decode none/small --out x.glb", 1, "none/small can't be read: there is no such file or folder"),
         ("decode small --random 2 --out x.glb", 1, "x.glb is one file; for several shapes, name a folder, such as x"),
         ("decode small --out x.xyz", 1, "there is no format 'xyz'; choose among glb, gltf, obj"),
