@@ -43,7 +43,7 @@ def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> N
     (folder / CARD).unlink(missing_ok=True)
     facts = {
         "licence": "All rights: *reserved*",
-        "title": "Fig|ure\n---\nx: y",
+        "title": "Left|right\n---\nx: y",
         "figures": {"r2": {"composite": {"total": "high"}}, "generalisation": []},
     }
     (folder / MANIFEST).write_text(json.dumps(manifest | facts))
@@ -57,7 +57,7 @@ def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> N
     head, text = head_and_text(folder)
     assert (head["license"], head["license_name"]) == ("other", "all-rights-reserved")
     assert "metrics" not in head
-    assert "# Fig\\|ure --- x: y\n" in text
+    assert "# Left\\|right --- x: y\n" in text
     add_card(folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == after
 
