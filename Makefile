@@ -42,8 +42,8 @@ help: ## list the targets
 serve: $(VENV)/.serve ## start the server with the bundled models (SHAPESPACE_HOST, SHAPESPACE_PORT)
 	@$(BIN)/python -m shapespace.service
 
-install: $(VENV)/.train ## install the shapespace-train command
-	@echo $(BIN)/shapespace-train
+install: $(VENV)/.train ## install the shapespace command with all that training needs
+	@echo $(BIN)/shapespace
 
 train: $(VENV)/.train ## train the bundled models from their generators
 	$(BIN)/shapespace-train run examples/freaky-torus.toml

@@ -17,7 +17,7 @@ TARGET = Path(__file__).parents[1] / "docs" / "reference" / "configuration.md"
 HEAD = """\
 # Configuration
 
-Every setting of a file for `shapespace-train run`, by its TOML table. `shapespace-train init` writes a file with the
+Every setting of a file for `shapespace run`, by its TOML table. `shapespace init` writes a file with the
 settings that most people change. A setting marked *required* has to be there. `run` refuses unknown settings.
 
 The [glossary](glossary.md) explains words such as *mode*, *factor* and *NRIC*.

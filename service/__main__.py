@@ -1,4 +1,4 @@
-"""``shapespace-serve``: the server as a command, with settings from environment variables ``SHAPESPACE_*``."""
+"""The command ``serve``, also as ``shapespace-serve``; its settings are environment variables ``SHAPESPACE_*``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from shapespace.command_line import USAGE, CommandParser, missing_packages
+import click
+
+from shapespace.command_line import Subcommand, call
 
 if TYPE_CHECKING:
     from shapespace.service.repository.validation import BundleValidator
@@ -25,28 +27,10 @@ NEEDED = (
 )  # fmt: skip
 
 
-def parser() -> CommandParser:
-    """Return the parser of the command line, which has no arguments but ``--help`` and ``--version``."""
-    return CommandParser(
-        prog="shapespace-serve",
-        description="Start the server: web page and HTTP interface for the models of a folder.",
-        epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT set the address, and "
-        "SHAPESPACE_MODELS_DIR the folder of models. docs/reference/settings.md lists all settings.",
-        advice="Settings are environment variables, as in: SHAPESPACE_HOST=127.0.0.1 SHAPESPACE_PORT=8001 "
-        "shapespace-serve",
-    )
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Serve until SIGTERM or SIGINT, and finish running requests.
-
-    Args:
-        arguments: of the command line; by default those that the program was called with.
-    """
-    parser().parse_args(arguments)
-    if sentence := missing_packages(NEEDED, "serve"):
-        print(f"shapespace-serve: {sentence}", file=sys.stderr)
-        raise SystemExit(USAGE)
+def serve(unknown: Sequence[str]) -> None:
+    """Serve until SIGTERM or SIGINT, and finish running requests."""
+    if unknown:
+        click.get_current_context().fail(f"unrecognized arguments: {' '.join(unknown)}")
     from shapespace.service.limits.process_memory import tune_malloc
     from shapespace.service.repository.validation import BundleValidator
 
@@ -63,8 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _serve(validator: BundleValidator) -> None:
     from pydantic import ValidationError
 
+    from shapespace.bundle.finding import BUNDLED
     from shapespace.service.repository.validation import bundle_folders
-    from shapespace.service.settings import BUNDLED, PREFIX, Settings, is_loopback, unknown_variables
+    from shapespace.service.settings import PREFIX, Settings, is_loopback, unknown_variables
 
     try:
         settings = Settings()
@@ -103,5 +88,26 @@ def _serve(validator: BundleValidator) -> None:
     Server(create_app(settings, validator), settings).run()
 
 
+COMMAND = Subcommand(
+    "serve",
+    serve,
+    help="Start the server: web page and HTTP interface for the models of a folder.",
+    epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT set the address, and "
+    "SHAPESPACE_MODELS_DIR the folder of models. docs/reference/settings.md lists all settings.",
+    # All that is unknown together, so that the message names all of it.
+    params=[click.Argument(["unknown"], nargs=-1, type=click.UNPROCESSED, metavar="")],
+    context_settings={"ignore_unknown_options": True},
+    examples=[""],
+    needs=NEEDED,
+    extra="serve",
+    advice="Settings are environment variables, as in: SHAPESPACE_HOST=127.0.0.1 SHAPESPACE_PORT=8001 shapespace serve",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve, with the arguments of the program by default."""
+    return call("shapespace-serve", COMMAND, arguments)
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

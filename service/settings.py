@@ -21,12 +21,10 @@ from pydantic import (
 )
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-import shapespace
+from shapespace.bundle.finding import BUNDLED
 from shapespace.service.versions import FILE_NAME, DefaultVersions
 
 PREFIX = "SHAPESPACE_"
-#: Folder of the models that are installed with the package.
-BUNDLED = Path(shapespace.__file__).parent / "models"
 
 
 class LogFormat(StrEnum):

@@ -1,9 +1,9 @@
 """Learned product shape manifolds of triangle meshes: a model turns a few numbers into a 3D shape.
 
-Load a trained model from its folder, and decode codes:
+Load a trained model by its name or from its folder, and decode codes:
 
 >>> import numpy as np, shapespace
->>> model = shapespace.load("models/figure")
+>>> model = shapespace.load("figure")
 >>> positions = model.decode(np.zeros((2, 20)))
 >>> positions.shape
 (2, 4601, 3)
@@ -66,6 +66,7 @@ from os.path import isfile
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from shapespace.bundle.finding import models
     from shapespace.bundle.reader import BundleError
     from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
     from shapespace.model.blend_shapes import PeriodicError
@@ -103,11 +104,12 @@ __all__ = [
     "FitOptions", "FitStatus", "InvalidMeshError", "InvalidScanError", "InvalidTargetError", "Landmark", "LatentError",
     "Material", "MeshChoice", "MeshError", "ModelFailedError", "Objective", "PeriodicError", "Prior", "PriorKind",
     "Quality", "ScaleChoice", "ShapeModel", "ShellSpace", "Status", "Target", "TriangleMesh", "centre_of_mass",
-    "elastic_mean", "exponential", "geodesic", "load", "logarithm", "parallel_transport",
+    "elastic_mean", "exponential", "geodesic", "load", "logarithm", "models", "parallel_transport",
 ]  # fmt: skip
 
 #: Public names by the module that defines them.
 _NAMES = {
+    "bundle.finding": "models",
     "bundle.reader": "BundleError",
     "mesh.triangle_mesh": "MeshError TriangleMesh",
     "model.blend_shapes": "PeriodicError",

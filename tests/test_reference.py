@@ -5,6 +5,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+import click
+
+from shapespace.__main__ import PROGRAM
 from shapespace.bundle.schema import ARRAYS, MANIFEST, Manifest
 from shapespace.files.formats import MESH_FORMATS, USD_FORMATS, VTK_FORMATS
 from shapespace.files.reading import SCAN_FORMATS
@@ -42,6 +45,16 @@ def test_every_file_of_a_run_directory() -> None:
     names = {str(getattr(file, "path", file)).removeprefix("RUN/").replace("factor-0", "factor-J") for file in files}
     table = page("run-directory").split("| file | holds |")[1]
     assert {name.rstrip("/") for name in first_cells(table)} == names
+
+
+def test_every_option_of_every_command() -> None:
+    for section in page("command").split("\n## ")[1:]:
+        title, text = section.split("\n", 1)
+        if commands := [PROGRAM.commands[name] for name in title.split(", ") if name in PROGRAM.commands]:
+            options = [option for command in commands for option in command.get_params(click.Context(command))]
+            names = {name for option in options for name in option.opts if name.startswith("--")}
+            assert {name.split()[0] for name in first_cells(text)} == names - {"--help", "--version"}, title
+    assert first_cells(page("command").split("\n## ")[0]) == {*PROGRAM.commands}
 
 
 def test_every_call() -> None:

@@ -179,6 +179,14 @@ def test_the_figure_is_served_from_an_empty_folder(installed: Path, tmp_path: Pa
     assert not any(tmp_path.iterdir())
 
 
+def test_the_figure_is_decoded_from_an_empty_folder(installed: Path, tmp_path: Path) -> None:
+    assert "figure" in run(installed / "shapespace", "models", cwd=tmp_path)
+    run(installed / "shapespace", "decode", "figure", "--random", "1", "--out", "figure.npz", cwd=tmp_path)
+    with np.load(tmp_path / "figure.npz") as file:
+        expected = load("figure").decode(load("figure").sample(1)[0])
+        np.testing.assert_array_equal(file["vertices"], expected.astype(np.float32))
+
+
 def test_workers_of_a_cluster_need_their_extra_alone(installed: Path, tmp_path: Path) -> None:
     program = """
 import sys

@@ -1,4 +1,4 @@
-"""The training command: ``shapespace-train init|run|status|report|export``.
+"""The commands that train: ``init``, ``run``, ``status``, ``report`` and ``export``, also as ``shapespace-train``.
 
 This module imports none of the packages that training needs, so that ``--help`` and ``--version`` always answer.
 """
@@ -6,11 +6,11 @@ This module imports none of the packages that training needs, so that ``--help``
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentTypeError
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
-from shapespace.command_line import USAGE, CommandParser, missing_packages
+import click
+
+from shapespace.command_line import FileOrFolder, Program, Several, Subcommand, call
 from shapespace.training.stages import STAGE_NAMES
 
 #: Packages of the extra ``train`` by the names of their modules, without those that are only faster.
@@ -19,115 +19,113 @@ NEEDED = (
     "tomlkit", "torch", "tqdm", "trimesh",
 )  # fmt: skip
 #: What ``init`` reads.
-MESHES = (
-    "folder of OBJ, PLY, STL, OFF, glTF or VTK files; or one NPZ file with all shapes; or one GLB or glTF file "
-    "whose morph targets are the shapes; or, with --file, a folder that has a folder for each subject"
+_MESHES = (
+    "MESH_DIR is a folder of OBJ, PLY, STL, OFF, glTF or VTK files; or one NPZ file with all shapes; or one GLB or "
+    "glTF file whose morph targets are the shapes; or, with --file, a folder that has a folder for each subject."
 )
-SUBJECTS = "read this file from each folder in MESH_DIR, for data with one folder per subject; may have * and ?"
+_SUBJECTS = "read this file from each folder in MESH_DIR, for data with one folder per subject; may have * and ?"
+_UNTIL = f"stop after this stage: {', '.join(STAGE_NAMES)}"
+_RUN = click.Argument(["run"], type=FileOrFolder(), metavar="RUN")
+_MODELS = click.Option(
+    ["--models"], type=FileOrFolder(), default="models", help="folder for the finished bundle (default: models)"
+)
 
 
-def _path(text: str) -> Path:
-    """Return a path of the command line, which must not be empty, as after a misspelt variable of the shell."""
-    if not text:
-        raise ArgumentTypeError("it is empty; name a file or folder, . for this one")
-    return Path(text)
-
-
-def _add_command(commands: Any, name: str, purpose: str) -> CommandParser:
-    command: CommandParser = commands.add_parser(name, help=purpose, description=f"{purpose[0].upper()}{purpose[1:]}.")
-    return command
-
-
-def parser() -> CommandParser:
-    """Return the parser of the command line."""
-    top = CommandParser(
-        prog="shapespace-train", description="Train a model on your meshes and export it for the server."
-    )
-    commands = top.add_subparsers(required=True, metavar="COMMAND", dest="command")
-
-    start = _add_command(commands, "init", "write a configuration for a folder of meshes in correspondence")
-    start.add_argument(
-        "meshes",
-        type=_path,
-        metavar="MESH_DIR",
-        help=MESHES,
-    )
-    start.add_argument(
-        "--out",
-        type=_path,
-        metavar="FILE.toml",
-        help="file to write (default: the folder's name with .toml, in the current folder)",
-    )
-    start.add_argument(
-        "--file",
-        metavar="NAME",
-        help=SUBJECTS,
-    )
-    start.add_argument(
-        "--parts",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="names of the parts to keep, the main part first",
-    )
-    start.add_argument("--force", action="store_true", help="replace FILE.toml if it exists")
-
-    run = _add_command(
-        commands, "run", "train the model of a configuration; a repeated command continues where the last one stopped"
-    )
-    run.add_argument("config", type=_path, metavar="CONFIG.toml")
-    run.add_argument(
-        "--data",
-        type=_path,
-        metavar="DIR",
-        help="folder of meshes or NPZ file, instead of collection.data in CONFIG.toml",
-    )
-    run.add_argument(
-        "--out", type=_path, metavar="DIR", help="folder for the results (default: runs/ and the name of CONFIG.toml)"
-    )
-    run.add_argument(
-        "--until", choices=STAGE_NAMES, metavar="STAGE", help=f"stop after this stage: {', '.join(STAGE_NAMES)}"
-    )
-    run.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers compute the samples"
-    )
-    run.add_argument(
-        "--accept",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="FILE",
-        help="use these shapes although their size or vertex order differs from the others",
-    )
-    run.add_argument(
-        "--keep-going",
-        action="store_true",
-        help="continue even if more than a quarter of the logarithms or samples fail",
+def _subcommand(
+    name: str, work: str, purpose: str, params: Sequence[click.Parameter], examples: Sequence[str], details: str = ""
+) -> Subcommand:
+    return Subcommand(
+        name,
+        f"shapespace.training.commands:{work}",
+        help=f"{purpose}\n\n{details}",
+        short_help=purpose,
+        params=params,
+        examples=examples,
+        needs=NEEDED,
+        extra="train",
     )
 
-    status = _add_command(commands, "status", "show which stages of a run are done")
-    report = _add_command(
-        commands, "report", "write RUN/report.html, with pictures and figures of all stages that are done"
-    )
-    export = _add_command(commands, "export", "finish a run, and write its bundle where it is missing or damaged")
-    for command in (status, report, export):
-        command.add_argument("run", type=_path, metavar="RUN")
-    for command in (run, export):
-        command.add_argument(
-            "--models", type=_path, default=Path("models"), help="folder for the finished bundle (default: models)"
-        )
-    return top
+
+COMMANDS = (
+    _subcommand(
+        "init",
+        "initialise",
+        "Write a configuration for a folder of meshes in correspondence.",
+        [
+            click.Argument(["meshes"], type=FileOrFolder(), metavar="MESH_DIR"),
+            click.Option(
+                ["--out"],
+                type=FileOrFolder(),
+                metavar="FILE.toml",
+                help="file to write (default: the folder's name with .toml, in the current folder)",
+            ),
+            click.Option(["--file"], metavar="NAME", help=_SUBJECTS),
+            Several(["--parts"], metavar="NAME…", help="names of the parts to keep, the main part first"),
+            click.Option(["--force"], is_flag=True, help="replace FILE.toml if it exists"),
+        ],
+        ["meshes", "study --file body.obj", "bodies --parts body eyes"],
+        _MESHES,
+    ),
+    _subcommand(
+        "run",
+        "run",
+        "Train the model of a configuration; a repeated command continues where the last one stopped.",
+        [
+            click.Argument(["config"], type=FileOrFolder(), metavar="CONFIG.toml"),
+            click.Option(
+                ["--data"],
+                type=FileOrFolder(),
+                metavar="DIR",
+                help="folder of meshes or NPZ file, instead of collection.data in CONFIG.toml",
+            ),
+            click.Option(
+                ["--out"],
+                type=FileOrFolder(),
+                metavar="DIR",
+                help="folder for the results (default: runs/ and the name of CONFIG.toml)",
+            ),
+            click.Option(["--until"], type=click.Choice(STAGE_NAMES), metavar="STAGE", help=_UNTIL),
+            click.Option(
+                ["--scheduler"],
+                metavar="ADDRESS",
+                help="address of a Dask scheduler, whose workers compute the samples",
+            ),
+            Several(
+                ["--accept"],
+                metavar="FILE…",
+                help="use these shapes although their size or vertex order differs from the others",
+            ),
+            click.Option(
+                ["--keep-going"],
+                is_flag=True,
+                help="continue even if more than a quarter of the logarithms or samples fail",
+            ),
+            _MODELS,
+        ],
+        ["meshes.toml", "meshes.toml --until modes", "meshes.toml --accept bar3.obj --out runs/again"],
+    ),
+    _subcommand("status", "status", "Show which stages of a run are done.", [_RUN], ["runs/meshes"]),
+    _subcommand(
+        "report",
+        "report",
+        "Write RUN/report.html, with pictures and figures of all stages that are done.",
+        [_RUN],
+        ["runs/meshes"],
+    ),
+    _subcommand(
+        "export",
+        "export",
+        "Finish a run, and write its bundle where it is missing or damaged.",
+        [_RUN, _MODELS],
+        ["runs/meshes", "runs/meshes --models path/to/models"],
+    ),
+)
+PROGRAM = Program(COMMANDS, help="Train a model on your meshes and export it for the server.")
 
 
 def main() -> int:
-    """Run the command. Every error ends with a message instead of a traceback."""
-    arguments = parser().parse_args()
-    if sentence := missing_packages(NEEDED, "train"):
-        print(f"shapespace-train: {sentence}", file=sys.stderr)
-        return USAGE
-    from shapespace.training.commands import carry_out
-
-    return carry_out(arguments)
+    """Run the command line, and return its exit code."""
+    return call("shapespace-train", PROGRAM)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""What the commands of ``shapespace-train`` do, and how their errors are told."""
+"""What the commands ``init``, ``run``, ``status``, ``report`` and ``export`` do."""
 
 from __future__ import annotations
 
-import argparse
-import os
+import functools
 import shlex
 import shutil
 import signal
 import sys
-import tempfile
-import traceback
-import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+import click
 
 from shapespace.bundle.reader import BundleError
-from shapespace.files.limits import in_words
+from shapespace.command_line import carry_out, near
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.learning import ExportError
@@ -32,8 +32,6 @@ from shapespace.training.stages.results import lost_files
 from shapespace.training.stages.run import STAGES, LostTooMuchError, OldRunError, execute, refuse_old
 from shapespace.training.stages.stage import Run, listed
 
-#: Exit codes: a fault of the input or of the machine, and a defect of the program (EX_SOFTWARE).
-FAILURE, DEFECT = 1, 70
 #: Errors whose message is a sentence for the user.
 EXPECTED = (
     BundleError,
@@ -55,18 +53,16 @@ EXPECTED = (
 HOME = Path(__file__).parents[2]
 
 
-def _here(path: Path) -> str:
-    """Return a path as a user can type it in the working directory."""
-    near = os.path.relpath(path)
-    return shlex.quote(str(path.resolve()) if near.startswith(os.path.join("..", "..")) else near)
+#: Modules that do the same as the programs, where these are not on the PATH.
+MODULES = {"shapespace": "shapespace", "shapespace-train": "shapespace.training"}
 
 
 def _program() -> str:
     """Return the command that calls this program again from here."""
-    called = Path(sys.argv[0])
-    if called.name != "shapespace-train":
-        return f"{shlex.quote(sys.executable)} -m shapespace.training"
-    return called.name if shutil.which(called.name) else _here(called)
+    called, name = Path(sys.argv[0]), str(click.get_current_context().find_root().info_name)
+    if called.stem != name:
+        return f"{shlex.quote(sys.executable)} -m {MODULES[name]}"
+    return name if shutil.which(name) else near(called)
 
 
 def _serving(models: Path) -> str:
@@ -74,7 +70,7 @@ def _serving(models: Path) -> str:
     setting = f"SHAPESPACE_MODELS_DIR={shlex.quote(str(models.resolve()))} "
     if not (HOME / "Makefile").is_file():
         return f"{setting}shapespace-serve"
-    where = "" if Path.cwd() == HOME else f" -C {_here(HOME)}"
+    where = "" if Path.cwd() == HOME else f" -C {near(HOME)}"
     return f"{'' if models.resolve() == HOME / 'models' else setting}make{where} serve"
 
 
@@ -89,30 +85,73 @@ def _open(folder: Path, models: Path) -> Run:
     return Run(folder, *load(directory.config.path), models)
 
 
-def _init(arguments: argparse.Namespace) -> None:
-    out, collection = init.write(
-        arguments.meshes, arguments.out, force=arguments.force, parts=arguments.parts, file=arguments.file
-    )
+def _command(work: Callable[..., None]) -> Callable[..., int]:
+    """Make a command of a function: its errors end with a message, and a traceback goes into the run directory."""
+
+    @functools.wraps(work)
+    def command(**options: Any) -> int:
+        def finish() -> None:
+            try:
+                work(**options)
+            except KeyboardInterrupt:
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
+                workers.stop()
+                raise
+
+        def folder() -> Path | None:
+            run = options.get("run") or ("config" in options and _folder(options["config"], options["out"]))
+            return run if run and RunDirectory(run).was_begun() else None
+
+        return carry_out(
+            finish,
+            EXPECTED,
+            stopped="stopped. The same command continues from here",
+            advice="The same command tries the stage again",
+            folder=folder,
+        )
+
+    return command
+
+
+@_command
+def initialise(meshes: Path, out: Path | None, file: str | None, parts: Sequence[str], force: bool) -> None:
+    """Write a configuration for a folder of meshes."""
+    written, collection = init.write(meshes, out, force=force, parts=parts, file=file)
     shapes, vertices = collection.vertices.shape[:2]
-    print(f"{out}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
+    print(f"{written}: for {shapes} shapes of {vertices} vertices and {len(collection.faces)} faces")
     for note in (*collection.notes, *(warning.sentence for warning in collection.warnings)):
         print(f"  {note}")
     accept = " ".join(shlex.quote(collection.names[warning.shape]) for warning in collection.warnings if warning.grave)
     if accept:
         print(f"A run would stop at {accept}: correct or remove it, or use it as it is with --accept {accept}")
-    print(f"Next: {_program()} run {_here(out)}")
+    print(f"Next: {_program()} run {near(written)}")
 
 
-def _run(arguments: argparse.Namespace) -> None:
-    config, source = load(arguments.config, arguments.data)
-    folder = _folder(arguments)
-    run = Run(folder, config, source, arguments.models, arguments.scheduler, arguments.accept)
+@_command
+def run(
+    config: Path,
+    data: Path | None,
+    out: Path | None,
+    until: str | None,
+    scheduler: str | None,
+    accept: Sequence[str],
+    keep_going: bool,
+    models: Path,
+) -> None:
+    """Train the model of a configuration."""
+    settings, source = load(config, data)
+    begun = Run(_folder(config, out), settings, source, models, scheduler, accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
-    _execute(run, arguments.until, keep_going=arguments.keep_going, command=again)
-    if arguments.until not in (None, "export"):
-        print(f"Done up to {arguments.until}. The same command without --until continues from there")
+    _execute(begun, until, keep_going=keep_going, command=again)
+    if until not in (None, "export"):
+        print(f"Done up to {until}. The same command without --until continues from there")
     else:
-        print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
+        print(f"{near(begun.bundle)} is ready. Next: {_serving(begun.models)}")
+
+
+def _folder(config: Path, out: Path | None) -> Path:
+    """Return the run directory of a configuration."""
+    return out or Path("runs") / config.stem
 
 
 def _execute(run: Run, until: str | None = None, *, keep_going: bool, command: str = "") -> None:
@@ -125,15 +164,10 @@ def _execute(run: Run, until: str | None = None, *, keep_going: bool, command: s
         print(f"report: {write_report(directory)}")
 
 
-def _folder(arguments: argparse.Namespace) -> Path:
-    """Return the run directory of a command line; ``init`` has none."""
-    if "run" in arguments:
-        return Path(arguments.run)
-    return Path(arguments.out or Path("runs") / arguments.config.stem)
-
-
-def _status(arguments: argparse.Namespace) -> None:
-    directory = RunDirectory(arguments.run)
+@_command
+def status(run: Path) -> None:
+    """Show which stages of a run are done."""
+    directory = RunDirectory(run)
     require_run(directory)
     begun = ": ".join(filter(None, ("begun", directory.at_work())))
     lost = list(lost_files(STAGES.values(), directory))
@@ -145,69 +179,17 @@ def _status(arguments: argparse.Namespace) -> None:
         print(f"{name:12} {state}")
 
 
-def _report(arguments: argparse.Namespace) -> None:
+@_command
+def report(run: Path) -> None:
+    """Write the report of a run."""
     from shapespace.training.report.page import write_report
 
-    print(write_report(RunDirectory(arguments.run)))
+    print(write_report(RunDirectory(run)))
 
 
-def _export(arguments: argparse.Namespace) -> None:
-    run = _open(arguments.run, arguments.models)
-    _execute(run, keep_going=True)
-    print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
-
-
-def _keep_traceback(arguments: argparse.Namespace) -> Path:
-    """Write the traceback of the current exception into the run directory, or into a temporary folder."""
-    text = traceback.format_exc()
-    folders = [] if "meshes" in arguments else [_folder(arguments)]
-    runs = [folder for folder in folders if RunDirectory(folder).was_begun()]
-    for folder in (*runs, Path(tempfile.mkdtemp())):
-        path = RunDirectory(folder).traceback.path
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError:
-            continue
-        break
-    return path
-
-
-_COMMANDS = {"init": _init, "run": _run, "status": _status, "report": _report, "export": _export}
-
-
-def carry_out(arguments: argparse.Namespace) -> int:
-    """Do what a command line says and return the exit code. Every error ends with a message, not with a traceback."""
-    received = [signal.SIGINT]
-
-    def terminate(number: int, _: object) -> None:
-        received[0] = signal.Signals(number)
-        warnings.filterwarnings("ignore", category=UserWarning, module=r"joblib\b")  # on work that is cut short
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, terminate)
-    signal.signal(signal.SIGTERM, terminate)
-    try:
-        _COMMANDS[arguments.command](arguments)
-    except EXPECTED as error:
-        return _fail(str(error))
-    except OSError as error:
-        return _fail(in_words(error))
-    except KeyboardInterrupt:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        workers.stop()
-        print("\nshapespace-train: stopped. The same command continues from here", file=sys.stderr)
-        return 128 + received[0]  # as shells report the end by a signal
-    except Exception as error:
-        what = " ".join(str(error).split())[:300]
-        print(
-            f"shapespace-train: internal error: {type(error).__name__}: {what}\n"
-            f"Please report it, and attach {_here(_keep_traceback(arguments))}. The same command tries the stage again",
-            file=sys.stderr,
-        )
-        return DEFECT
-    return 0
-
-
-def _fail(sentence: str) -> int:
-    print(f"shapespace-train: {sentence}", file=sys.stderr)
-    return FAILURE
+@_command
+def export(run: Path, models: Path) -> None:
+    """Finish a run and write its bundle."""
+    opened = _open(run, models)
+    _execute(opened, keep_going=True)
+    print(f"{near(opened.bundle)} is ready. Next: {_serving(opened.models)}")

@@ -8,13 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeVar
 
-import numpy as np
-
 from shapespace.files.limits import Limits
-from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.correspondence import InvalidMeshError, limits, match
 from shapespace.model.edit import require_targets
-from shapespace.model.fit_result import Distances
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
@@ -193,7 +189,7 @@ async def edit(
             "distances": found.distances,
             "status": found.status,
             "iterations": found.iterations,
-            "placement": placement(found.placement),
+            "placement": found.placement.answer(),
             "diagnostics": asdict(found.shape.diagnostics),
             "covariance": found.covariance,
             "samples": found.samples,
@@ -223,26 +219,7 @@ async def fit(
         model, options = asked(fields)
         read = time.perf_counter()
         found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline)
-        content = {
-            "latent": found.code,
-            "covariance": found.covariance,
-            "placement": placement(found.placement),
-            "distances": {"scan": _distances(found.scan), "model": _distances(found.model)},
-            "explained": found.explained,
-            "seen": found.seen,
-            "noise": found.noise,
-            "mirrored": found.mirrored,
-            "status": found.status,
-            "reason": found.reason,
-            "sampled": found.sampled,
-            "shapes": {"solved": found.solved, "rough": found.rough},
-            "diagnostics": asdict(found.shape.diagnostics),
-        }
-        if found.used is not None:
-            content["used"] = {"positions": float32(found.used[:, :3]), "distances": float32(found.used[:, 3])}
-        if options.samples:
-            content["samples"] = found.samples
-        return content, {"read": read - began, "search": time.perf_counter() - read}
+        return found.answer(), {"read": read - began, "search": time.perf_counter() - read}
 
     return await _searched(workers, caller, _SMALLER, make)
 
@@ -261,20 +238,9 @@ async def _searched(workers: Workers, caller: Caller, advice: str, make: Callabl
         return await workers.run(search, call)
 
 
-def _distances(found: Distances) -> dict[str, Any]:
-    figures: dict[str, Any] = {"mean": found.mean, "p95": found.p95, "max": found.max}
-    return figures if found.points is None else figures | {"points": float32(found.points)}
-
-
 def _require_few_samples(options: SearchOptions, most: int) -> None:
     if options.samples:
         require_count(options.samples, most, "samples")
-
-
-def placement(found: Placement) -> dict[str, Any]:
-    """Return a placement as answers hold it."""
-    rotation = np.ascontiguousarray(found.rotation)  # the JSON writer needs contiguous arrays
-    return {"rotation": rotation, "translation": found.translation, "scale": found.scale}
 
 
 def read_upload(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from shapespace.bundle.geometry import Geometry, GeometryError
-from shapespace.bundle.schema import MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
+from shapespace.bundle.schema import CARD, MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
 from shapespace.files.npz import npz_headers, read_npz
 
 #: Most bytes of a manifest.
@@ -43,6 +43,7 @@ class Bundle(Geometry):
     # SHA-256 of the manifest in hexadecimal. The manifest has the digests of all files, so this digest identifies every
     # byte of the bundle.
     digest: str
+    folder: Path  # absolute path of the folder NAME/VERSION
     networks: Mapping[str, bytes]  # content of each ONNX file by name
 
 
@@ -63,25 +64,37 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     """Read and verify ``models/NAME/VERSION``, which must have the digest if one is given. Raises BundleError if the
     bundle differs from its manifest, or breaks the schema.
     """
-    check_place(folder)
-    name, version = folder.parent.name, folder.name
-    text = _manifest(folder)
-    if digest not in (None, hashlib.sha256(text).hexdigest()):
+    manifest, found = _read_manifest(folder)
+    if digest not in (None, found):
         raise BundleError("its files changed while the server tested it")
+    files = read_files(folder, manifest)
+    files.pop(CARD, None)
+    textures = {file: files.pop(file) for file in (manifest.surface.textures if manifest.surface else ())}
+    geometry = _geometry(files.pop(manifest.geometry.file), manifest, textures)
+    for file, content in files.items():
+        _check_network(file, content)
+    return Bundle(manifest=manifest, digest=found, folder=folder.absolute(), networks=files, **vars(geometry))
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Return the manifest of ``models/NAME/VERSION``, without reading its files; raises BundleError or OSError."""
+    return _read_manifest(folder)[0]
+
+
+def _read_manifest(folder: Path) -> tuple[Manifest, str]:
+    """Return the manifest and its digest."""
+    check_place(folder)
+    text = _manifest(folder)
     try:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(map(str, first["loc"]))
         raise BundleError(f"{MANIFEST}: {place + ': ' if place else ''}{first['msg']}") from None
-    if (manifest.name, manifest.version) != (name, version):
-        raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {name}/{version}")
-    files = read_files(folder, manifest)
-    textures = {file: files.pop(file) for file in (manifest.surface.textures if manifest.surface else ())}
-    geometry = _geometry(files.pop(manifest.geometry.file), manifest, textures)
-    for file, content in files.items():
-        _check_network(file, content)
-    return Bundle(manifest=manifest, digest=hashlib.sha256(text).hexdigest(), networks=files, **vars(geometry))
+    if (manifest.name, manifest.version) != (folder.parent.name, folder.name):
+        own = f"{folder.parent.name}/{folder.name}"
+        raise BundleError(f"{MANIFEST} is of {manifest.name}/{manifest.version}, not of {own}")
+    return manifest, hashlib.sha256(text).hexdigest()
 
 
 def read_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:

@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFlo
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
+#: The card, for people. It is optional.
+CARD = "README.md"
 NAME_PATTERN = r"^[a-z0-9][a-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^[1-9][0-9]{0,8}$"
 #: A plain file name: without a folder, so that it can't leave the bundle, and not hidden.
@@ -155,6 +157,7 @@ class Manifest(_Strict):
         named = [network.file for network in (*self.factors, self.combiner)] + [self.geometry.file]
         named += [self.start.file] if self.start else []
         named += self.surface.textures if self.surface else []
+        named += [CARD] if CARD in self.files else []
         if sorted(named) != sorted(self.files):
             raise ValueError("files must list exactly the networks, the geometry and the textures")
         return self

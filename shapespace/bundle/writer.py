@@ -12,9 +12,11 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.attributes import surface_entry
+from shapespace.bundle.card import card
 from shapespace.bundle.geometry import Geometry
-from shapespace.bundle.reader import BundleError
+from shapespace.bundle.reader import BundleError, read_bundle, read_files
 from shapespace.bundle.schema import (
+    CARD,
     COMBINER,
     GEOMETRY,
     MANIFEST,
@@ -91,7 +93,7 @@ def require_replaceable(folder: Path, names: Iterable[str] = ()) -> None:
     except (OSError, ValueError, LookupError, TypeError):
         own = set()
     if {COMBINER.file, GEOMETRY.file, factor_network(0).file} <= present:
-        own |= {MANIFEST, COMBINER.file, GEOMETRY.file, START.file, *names}
+        own |= {MANIFEST, CARD, COMBINER.file, GEOMETRY.file, START.file, *names}
         own |= {factor_network(j).file for j in range(len(present))}
     if others := sorted(present - own):
         named = ", ".join(map(clipped, others[:3])) + (", …" if len(others) > 3 else "")
@@ -114,16 +116,28 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
         files[START.file] = networks.start
     if geometry.surface:
         files |= geometry.surface.textures
-    manifest = _manifest(facts, geometry, files)
-    text = json.dumps(manifest.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
-
     folder = models / facts.name / facts.version
     require_replaceable(folder, files)
+    _replace(folder, files, _manifest(facts, geometry, files), geometry)
+    return folder
+
+
+def add_card(folder: Path) -> None:
+    """Write the card of a bundle that has none, or whose manifest has changed; raises BundleError or OSError."""
+    bundle = read_bundle(folder)
+    _replace(folder, read_files(folder, bundle.manifest), bundle.manifest, bundle)
+
+
+def _replace(folder: Path, files: Mapping[str, bytes], manifest: Manifest, geometry: Geometry) -> None:
+    """Write or replace a bundle, with its card."""
+    files = {**files, CARD: card(manifest, geometry)}
+    entries = {name: entry(files[name]) for name in sorted(files)}
+    listed = manifest.model_copy(update={"files": entries})
+    text = json.dumps(listed.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
     with replaced_folder(folder) as part:
         for name, content in (files | {MANIFEST: text.encode()}).items():
             with synced_file(part / name) as file:
                 file.write(content)
-    return folder
 
 
 def entry(content: bytes) -> FileEntry:

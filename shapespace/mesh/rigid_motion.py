@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,11 @@ class Placement:
     def after(self, first: Placement) -> Placement:
         """Return the composition: ``first``, then this placement."""
         return Placement(self.rotation @ first.rotation, self(first.translation), self.scale * first.scale)
+
+    def answer(self) -> dict[str, Any]:
+        """Return the members of the JSON answer."""
+        rotation = np.ascontiguousarray(self.rotation)  # JSON writers need contiguous arrays
+        return {"rotation": rotation, "translation": self.translation, "scale": self.scale}
 
     @classmethod
     def between(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement
@@ -59,6 +61,11 @@ class Distances:
         """Summarise distances (n,)."""
         return cls(float(distances.mean()), float(np.quantile(distances, 0.95)), float(distances.max()), points)
 
+    def answer(self) -> dict[str, Any]:
+        """Return the members of the JSON answer."""
+        figures: dict[str, Any] = {"mean": self.mean, "p95": self.p95, "max": self.max}
+        return figures if self.points is None else figures | {"points": _float32(self.points)}
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -101,3 +108,28 @@ class Fitted:
     used: FloatArray | None
     solved: int
     rough: int
+
+    def answer(self) -> dict[str, Any]:
+        """Return the members of the JSON answer, with NumPy arrays; positions and distances are float32."""
+        content: dict[str, Any] = {
+            "latent": self.code,
+            "covariance": self.covariance,
+            "placement": self.placement.answer(),
+            "distances": {"scan": self.scan.answer(), "model": self.model.answer()},
+            "explained": self.explained,
+            "seen": self.seen,
+            "noise": self.noise,
+            "mirrored": self.mirrored,
+            "status": self.status,
+            "reason": self.reason,
+            "sampled": self.sampled,
+            "shapes": {"solved": self.solved, "rough": self.rough},
+            "diagnostics": asdict(self.shape.diagnostics),
+        }
+        if self.used is not None:
+            content["used"] = {"positions": _float32(self.used[:, :3]), "distances": _float32(self.used[:, 3])}
+        return content | ({"samples": self.samples} if len(self.samples) else {})
+
+
+def _float32(array: FloatArray) -> NDArray[np.float32]:
+    return np.ascontiguousarray(array, dtype=np.float32)

@@ -65,6 +65,12 @@ class Distribution(StrEnum):
     POPULATION = "population"
 
 
+def _read_only(values: Sequence[float]) -> FloatArray:
+    array = np.array(values)
+    array.setflags(write=False)
+    return array
+
+
 class LatentSpace:
     """Coordinates of a model's codes, with their bounds and periods.
 
@@ -75,7 +81,7 @@ class LatentSpace:
     def __init__(self, manifest: Manifest) -> None:
         self.model = manifest.name
         self.names = manifest.latent_names
-        self.lower, self.upper = np.array(manifest.lower), np.array(manifest.upper)
+        self.lower, self.upper = _read_only(manifest.lower), _read_only(manifest.upper)
         self.periodic = np.array([period is not None for period in manifest.period])
         self._period = np.array([period or 1.0 for period in manifest.period])
         # Rounded like codes, so that a bound itself always counts as inside.
@@ -126,7 +132,7 @@ class LatentSpace:
             i, k = np.argwhere(outside)[0]
             raise OutOfBoundsError(
                 f"Coordinate {k} ({self.names[k]}) of code {i} is {x[i, k]:g}, outside "
-                f'[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or send "bounds": "clamp" or "allow".'
+                f"[{self._low[k]:g}, {self._high[k]:g}]. Move it inside, or choose clamp or allow for bounds."
             )
         # Adding zero turns −0 into 0, so that a shape has only one code.
         inside = np.logical_not(outside.any(axis=1))

@@ -4,6 +4,8 @@ Each option is written here once, with its name, type, default, limits and descr
 single options by name. The HTTP interface derives its query parameters and JSON bodies from these classes.
 """
 
+import inspect
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
@@ -192,3 +194,14 @@ class FitOptions(SearchOptions):
     distribution: Prior = Prior.POPULATION
     points: bool = False
     used: bool = False
+
+
+def descriptions(kind: type) -> dict[str, str]:
+    """Return the lines on attributes in the docstrings of a class and its bases, as Markdown."""
+    found: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        _, _, section = inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")
+        for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE):
+            plain = " ".join(text.split()).replace("``", "`")
+            found[name] = plain[0].upper() + plain[1:]
+    return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -14,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.bundle.reader import Bundle, BundleError, read_bundle
-from shapespace.bundle.schema import MANIFEST, VERSION_PATTERN
+from shapespace.bundle.finding import find_bundle
+from shapespace.bundle.reader import Bundle, BundleError, manifest_digest, read_bundle
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.blend_shapes import BlendShapes, blend_shapes
 from shapespace.model.correspondence import Matched
@@ -43,35 +42,32 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
     """Read a bundle, check every file against its manifest, and make a model of it.
 
     Args:
-        folder: folder NAME/VERSION, or NAME for the highest version in it.
+        folder: folder NAME/VERSION; folder NAME, for the highest version in it; or a name that ``shapespace.models``
+            lists.
         threads: number of shapes that may be computed at once, see Decoder.
 
     Raises:
-        BundleError: there is no bundle, or it differs from its manifest.
+        BundleError: there is no such model, or its files differ from its manifest.
 
     >>> import shapespace
-    >>> shapespace.load("models/figure")
+    >>> shapespace.load("figure")
     <ShapeModel figure/3: 20 coordinates, 10 factors, 4601 vertices>
     """
-    path = Path(os.path.abspath(folder))  # makes "." absolute: the names of the last two folders matter
-    if not (path / MANIFEST).exists():
-        try:
-            versions = [int(entry.name) for entry in path.iterdir() if re.fullmatch(VERSION_PATTERN, entry.name)]
-        except OSError as error:
-            raise BundleError(f"{path} can't be read: {error.strerror}") from None
-        if not versions:
-            raise BundleError(
-                f"{path} holds no bundle: name a folder NAME/VERSION, or a folder NAME with versions in it"
-            )
-        path /= str(max(versions))
-    return ShapeModel(read_bundle(path), threads)
+    return ShapeModel(read_bundle(find_bundle(folder)), threads)
+
+
+def _load_unchanged(folder: Path, threads: int, digest: str) -> ShapeModel:
+    if manifest_digest(find_bundle(folder)) != digest:
+        raise BundleError(f"{folder} has changed since the model was pickled: load the model again, then pickle it")
+    return ShapeModel(read_bundle(folder, digest), threads)
 
 
 class ShapeModel:
     """A trained model, with the same operations as the HTTP interface.
 
     Codes are (m,) numbers, one for each coordinate. Positions are in the units of the training meshes, aligned to
-    the reference. Several threads may call every method at once.
+    the reference. Several threads may call every method at once. A pickled model holds the folder of its bundle, and
+    reads it again in the process that unpickles it.
 
     Args:
         bundle: verified bundle.
@@ -79,13 +75,14 @@ class ShapeModel:
 
     Attributes:
         decoder: networks and solver of the model.
+        folder: folder NAME/VERSION of the bundle.
         manifest, digest: manifest of the bundle, and its SHA-256.
         latents: latent coordinates with their names, bounds and periods.
         population: Gaussian of the training codes, or of uniform codes where the model has no training codes.
         reference: reference mesh, coarse and normalised.
         dimension: number m of coordinates of a code.
         names: name of each coordinate.
-        lower, upper: bounds (m,) of the coordinates: the smallest and largest values in training.
+        lower, upper: bounds (m,) of the coordinates: the smallest and largest values in training. Both are read-only.
         period: period of each coordinate; None for a coordinate that is no angle.
 
     >>> import shapespace
@@ -101,6 +98,7 @@ class ShapeModel:
     @OneBlasThread()
     def __init__(self, bundle: Bundle, threads: int = 1) -> None:
         self.decoder = decoder = Decoder(bundle, threads)
+        self.folder, self._threads = bundle.folder, threads
         self.manifest, self.digest, self.reference = decoder.manifest, decoder.digest, decoder.reference
         self.latents, self.population = decoder.latents, decoder.population
         self.dimension, self.names = self.latents.dimension, self.latents.names
@@ -112,6 +110,9 @@ class ShapeModel:
             f"<ShapeModel {facts.name}/{facts.version}: {self.dimension} coordinates, {len(facts.factors)} factors, "
             f"{len(self.vertices)} vertices>"
         )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _load_unchanged, (self.folder, self._threads, self.digest)
 
     @property
     def faces(self) -> IntArray:

@@ -5,9 +5,7 @@ Names, defaults, limits and descriptions come from the dataclasses in ``shapespa
 
 from __future__ import annotations
 
-import inspect
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, fields
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -15,6 +13,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 from fastapi.exceptions import RequestValidationError
 from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 
+from shapespace.model.options import descriptions
 from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Number, NumbersByIndex, Whole
@@ -103,7 +102,7 @@ def _decorator(
     without: Sequence[str],
     limits: Mapping[str, Mapping[str, Any]],
 ) -> Callable[[type[M]], type[M]]:
-    hints, descriptions = get_type_hints(kind), _descriptions(kind)
+    hints, told = get_type_hints(kind), descriptions(kind)
 
     def derive(base: type[M]) -> type[M]:
         members: dict[str, Any] = {}
@@ -111,7 +110,7 @@ def _decorator(
             name, hint, default = option.name, hints[option.name], option.default
             if default is MISSING:
                 default = ... if option.default_factory is MISSING else option.default_factory()
-            described = {"description": descriptions.get(name), **option.metadata, **limits.get(name, {})}
+            described = {"description": told.get(name), **option.metadata, **limits.get(name, {})}
             examples = [json.dumps(example, default=asdict) for example in described.pop("examples", ())]
             if hint in json_types:
                 default, hint = None, _json_text(json_types[hint])
@@ -134,14 +133,3 @@ def _json_text(kind: Any) -> Any:
 
     # A plain string for FastAPI, which would collect repeated parameters for a list.
     return Annotated[str, AfterValidator(read), Field(json_schema_extra={"contentMediaType": "application/json"})]
-
-
-def _descriptions(kind: type) -> dict[str, str]:
-    """Return the lines on attributes in the docstrings of a class and its bases, as Markdown."""
-    found: dict[str, str] = {}
-    for each in reversed(kind.__mro__):
-        _, _, section = inspect.cleandoc(each.__doc__ or "").partition("Attributes:\n")
-        for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE):
-            plain = " ".join(text.split()).replace("``", "`")
-            found[name] = plain[0].upper() + plain[1:]
-    return found

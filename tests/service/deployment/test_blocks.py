@@ -13,14 +13,17 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
 import httpx
 import pytest
 
+from shapespace.__main__ import PROGRAM
+from shapespace.command_line import Subcommand
 from shapespace.service.settings import PREFIX, Settings
-from shapespace.training.__main__ import parser
 from tests.long.__main__ import TESTS
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
@@ -85,11 +88,11 @@ def try_command(line: str) -> None:
                 variable, is_variable, _ = word.partition("=")
                 known = rf"\$\([^)]*\b{variable}\b" if is_variable else rf"^{word}:.*##"
                 assert re.search(known, MAKEFILE, re.MULTILINE), f"the Makefile has no {word}"
-        case "shapespace-train" if len(words) == 1:
-            with pytest.raises(SystemExit, match=r"^0$"):
-                parser().parse_args([*words, "--help"])
-        case "shapespace-train":
-            parser().parse_args(words)
+        case "shapespace" | "shapespace-train":
+            command = PROGRAM.commands[words[0]]
+            assert isinstance(command, Subcommand)
+            with suppress(click.exceptions.Exit):  # of --help
+                command.make_context(words[0], words[1:] or ["--help"])
         case "python" if words[0] == "-m":
             assert importlib.util.find_spec(words[1]), words[1]
         case "dask":
@@ -206,7 +209,7 @@ COMMANDS = sorted(
         command.replace("\n", " ")
         for page in PAGES
         if page.name != "CHANGELOG.md"  # which also names commands that are gone
-        for command in re.findall(r"`((?:make|shapespace-train|python -m|dask) [^`]+)`", text_of(page))
+        for command in re.findall(r"`((?:make|shapespace|shapespace-train|python -m|dask) [^`]+)`", text_of(page))
     }
 )
 

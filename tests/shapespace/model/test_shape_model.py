@@ -1,8 +1,11 @@
 """The model in Python: it is loaded from its folder, and its results are those of the server."""
 
+import multiprocessing
 import os
+import pickle
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +16,9 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
+import shapespace
+from shapespace.bundle import finding
+from shapespace.bundle.finding import BUNDLED
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
@@ -149,6 +155,50 @@ def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) 
     for folder in (models, models / "small" / "1" / "manifest.json", models / "none"):
         with pytest.raises(BundleError, match="holds no bundle" if folder == models else "can't be read"):
             load(folder)
+
+
+def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert {"figure", "freaky-torus"} <= shapespace.models().keys()
+    assert load("figure").folder == BUNDLED / "figure" / "3"
+    (tmp_path / "figure").mkdir()  # a folder of meshes, say
+    (tmp_path / "models" / "odd").mkdir(parents=True)
+    assert load("figure/3").manifest.name == "figure"
+    shutil.copytree(models / "small", tmp_path / "models" / "small")
+    write_bundle(tmp_path / "models", "figure", "7")
+    listed = shapespace.models()
+    assert (listed["small"].version, listed["small"].dimension) == ("10", 3)
+    assert listed["figure"].folder == tmp_path / "models" / "figure" / "7"
+    assert load("small").manifest.version == "10"
+    for unknown in ("figur", "small/3"):
+        with pytest.raises(BundleError, match=f"no model {unknown} here: choose among figure, freaky-torus, small, or"):
+            load(unknown)
+    for folder in ("models/figur", "../figure", "figure/3/4"):
+        with pytest.raises(BundleError, match="can't be read: there is no such file or folder"):
+            load(folder)
+    monkeypatch.setattr(finding, "BUNDLED", tmp_path / "none")
+    assert list(shapespace.models()) == ["figure", "small"]
+
+
+def test_a_model_is_sent_to_another_process_by_its_folder(models: Path, tmp_path: Path) -> None:
+    shutil.copytree(models / "small" / "2", tmp_path / "small" / "2")
+    model = load(tmp_path / "small" / "2", threads=2)
+    content = pickle.dumps(model)
+    assert len(content) < 1000
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        np.testing.assert_array_equal(pool.submit(model.decode, CODES).result(), model.decode(CODES))
+    write_bundle(tmp_path, "small", "2", fine=True)
+    with pytest.raises(BundleError, match="has changed since the model was pickled"):
+        pickle.loads(content)  # noqa: S301
+    shutil.rmtree(tmp_path / "small")
+    with pytest.raises(BundleError, match="can't be read"):
+        pickle.loads(content)  # noqa: S301
+
+
+def test_bounds_are_read_only(model: ShapeModel) -> None:
+    for bounds in (model.lower, model.upper):
+        with pytest.raises(ValueError, match="read-only"):
+            bounds[0] = 0
 
 
 def test_its_facts(model: ShapeModel) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from shapespace.__main__ import main as every_command
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
 from shapespace.training.collection.faults import IngestError
@@ -138,6 +140,12 @@ def test_the_command_says_what_comes_next(
         "my meshes.toml: for 4 shapes of 42 vertices and 80 faces",
         "Next: shapespace-train run 'my meshes.toml'",
     ]
+    monkeypatch.setattr(sys, "argv", ["shapespace", "init", str(folder), "--force"])
+    assert every_command() == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "Next: shapespace run 'my meshes.toml'"
+    monkeypatch.setattr(sys, "argv", ["shapespace/__main__.py", "init", str(folder), "--force"])
+    assert every_command() == 0
+    assert capsys.readouterr().out.endswith(f"Next: {shlex.quote(sys.executable)} -m shapespace run 'my meshes.toml'\n")
     assert run(monkeypatch, "init", folder) == 1
     assert "exists already" in capsys.readouterr().err
     assert run(monkeypatch, "init", folder, "--force", "--out", "other.toml") == 0
