@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.fit import SETTINGS
 from shapespace.model.fit_result import FitStatus, Fitted
+from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
 from shapespace.model.options import Landmark
 from shapespace.model.scan import InvalidScanError, scan_of
