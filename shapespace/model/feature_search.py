@@ -50,7 +50,8 @@ class FeatureSearch:
         if no move promises enough.
         """
         n, best, found = pairs.of_scan, 0.0, None
-        heights, weights = pairs.heights[:n], pairs.barycentric[:n]
+        # Scan points near a feature in the wrong place find the surface beside it. Only its own vertices are far away.
+        known = np.arange(len(pairs.heights)) >= (n if len(pairs.heights) > n else 0)
         for j, images in self.images.items():
             factor = self.decoder.manifest.factors[j]
             own = slice(factor.start, factor.stop)
@@ -58,10 +59,10 @@ class FeatureSearch:
                 continue
 
             def at_points(fields: FloatArray) -> FloatArray:
-                return np.einsum("knc,nc->kn", fields[:, pairs.corners[:n]], weights)
+                return np.einsum("knc,nc->kn", fields[:, pairs.corners], pairs.barycentric)
 
             here = at_points(_normal_displacements(self.decoder, reconstruct, j, code[None, own]))
-            wanted, images = heights + here[0], at_points(images)
+            wanted, images = pairs.heights + known * here[0], at_points(images)
             gain = _explained(wanted, images)
             most = float(gain.max() - PROMISING * _explained(wanted, here)[0])
             if most > best:
