@@ -57,7 +57,8 @@ class MeshProximity:
         corners = self.vertices[self.vertex_faces.faces[candidates]]
         barycentric = closest_barycentric(points[:, None], corners)
         places = np.einsum("nkc,nkcx->nkx", barycentric, corners)
-        squares = ((places - points[:, None]) ** 2).sum(axis=-1)
+        gaps = places - points[:, None]
+        squares = np.vecdot(gaps, gaps)
         best = (np.arange(len(points)), squares.argmin(axis=1))
         return Closest(np.sqrt(squares[best]), candidates[best], barycentric[best], places[best])
 
@@ -70,8 +71,7 @@ def closest_barycentric(points: FloatArray, corners: FloatArray) -> FloatArray:
     """
     a, b, c = (corners[..., k, :] for k in range(3))
     ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
-    d20, d21 = (ap * ab).sum(-1), (ap * ac).sum(-1)
+    d00, d01, d11, d20, d21 = (np.vecdot(u, v) for u, v in ((ab, ab), (ab, ac), (ac, ac), (ap, ab), (ap, ac)))
     tiny = np.finfo(float).tiny
     scale = d00 * d11 - d01**2
     has_area = scale > 1e-12 * d00 * d11

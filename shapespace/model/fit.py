@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -13,9 +13,11 @@ from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.feature_search import FeatureSearch
 from shapespace.model.fit_constraints import FitConstraints
-from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted
+from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted, VertexDerivatives
 from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, SearchAccuracy
+from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import FitOptions
 from shapespace.model.placement import QUICK, THOROUGH, PlacementEffort, StartPlacement, evenly, start_placements
@@ -30,61 +32,6 @@ from shapespace.solve.outcome import Status
 CHUNK = 50_000
 
 
-@dataclass(frozen=True)
-class ScanFitSettings:
-    """Sizes and thresholds of a fit. Distances are fractions of the reference's diagonal.
-
-    Attributes:
-        start_shapes, random_shapes: number of start shapes, chosen as far apart as possible from random shapes.
-        shape_points: number of points of a start shape that are compared with the scan.
-        coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
-        rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
-        behind: in the last round, a second start takes part if it costs at most this multiple of the best.
-        middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
-        again_steps: further steps with few points if the result is poor.
-        attempts, attempt_steps: attempts to move a limb of the model to one of the scan, and the iterations of each,
-        drawn_steps: of which this number pulls the limb by target points.
-        units, units_of_part: a scan (of a part) that is this many times larger or smaller than the model's shapes is
-            taken to be in other units, unless the scale is free.
-        missed, unseen: a fit is poor if larger shares of the scan and of the model are far from the other side.
-            Outliers raise only the first share, holes only the second. A limb in the wrong place raises both.
-        missed_of_part: limit of the first share for a scan of a part.
-        restless: a fit has not converged if its last step was longer than this distance.
-        elsewhere: a fit is ambiguous if another fit differs by at least this mean distance,
-        nearly, beside: and costs at most ``nearly`` times as much plus ``beside``.
-        mirrored: a scan counts as mirrored if its mirror image costs less than this share.
-        rivals: maximum number of other fits that are refined to the end.
-    """
-
-    start_shapes: int = 16
-    random_shapes: int = 200
-    shape_points: int = 150
-    coarse_vertices: int = 500
-    fine_vertices: int = 2000
-    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.6, 2), (0.0, 4))
-    behind: float = 1.5
-    middle_steps: int = 8
-    last_steps: int = 6
-    again_steps: int = 10
-    attempts: int = 4
-    attempt_steps: int = 9
-    drawn_steps: int = 4
-    units: float = 3.0
-    units_of_part: float = 20.0
-    missed: float = 0.015
-    unseen: float = 0.008
-    missed_of_part: float = 0.03
-    restless: float = 5e-3
-    elsewhere: float = 0.05
-    nearly: float = 1.1
-    beside: float = 3e-3
-    mirrored: float = 0.6
-    rivals: int = 2
-
-
-SETTINGS = ScanFitSettings()
-
-
 class Fitter:
     """Fits a model to scans; several threads may use it at once.
 
@@ -97,6 +44,7 @@ class Fitter:
 
     def __init__(self, decoder: Decoder) -> None:
         self.decoder = decoder
+        self._features: FeatureSearch | None = None
 
     def __call__(
         self, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None = None
@@ -137,6 +85,17 @@ class Fitter:
     def starts(self) -> tuple[FloatArray, FloatArray]:
         """Start codes (k, m) and their shapes (k, V, 3), coarse and aligned; made at the first scan."""
         return self.shapes_of(self.codes({}))
+
+    @cached_property
+    def start_derivatives(self) -> dict[int, VertexDerivatives]:
+        """Derivatives at start codes, by their index, as earlier fits have computed them."""
+        return {}
+
+    def features(self, reconstruct: Reconstructor) -> FeatureSearch:
+        """Return the search for features that move around a shape; made at the first scan."""
+        if self._features is None:
+            self._features = FeatureSearch.of(self.decoder, reconstruct)
+        return self._features
 
     def codes(self, fixed: Mapping[int, float]) -> FloatArray:
         """Return the mean code and codes far apart from each other, (k, m), with some coordinates fixed."""
@@ -179,6 +138,7 @@ class _Fit:
             self._require_units()
         with self.decoder.solver() as reconstruct:
             rough = self._search(reconstruct, self.scan, self.constraints, ROUGH)
+            self.features = self.fitter.features(reconstruct)
             best, others = self._roughly(rough, QUICK, *([THOROUGH] if self.constraints.partial else []))
             full = self._search(reconstruct, self.scan, self.constraints, SOLVED)
             middle = self._search(reconstruct, self.scan, self.constraints, MIDDLE)
@@ -248,6 +208,7 @@ class _Fit:
         base: FitState | None = None
         for effort in efforts:
             states = sorted([*states, *self._followed(search, effort)], key=lambda state: state.cost)
+            states[0] = search.with_moved_feature(states[0], self.features, SETTINGS.attempt_steps)
             for k in range(SETTINGS.attempts):
                 if self._late or states[0].cost > limit or not self._is_poor(*search.shares(states[0])):
                     return states[0], states[1:]
@@ -255,15 +216,13 @@ class _Fit:
                 before, base = base, states[0] if k < 2 or k - 1 >= len(states) else states[k - 1]
                 if base is not before:  # otherwise it would end in the same place
                     again = search.run(base, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
+                    again = search.with_moved_feature(again, self.features, SETTINGS.attempt_steps)
                     states[0] = min(states[0], again, key=lambda state: state.cost)
         return states[0], states[1:]
 
     def _followed(self, search: FitSearch, effort: PlacementEffort) -> list[FitState]:
         """Return fits with rough shapes from the start placements, the best first."""
-        states = [
-            FitState(self.codes[start.shape], self.shapes[start.shape], start.placement)
-            for start in self._placed(search, effort)
-        ]
+        states = [self._start(search, start) for start in self._placed(search, effort)]
         for part, steps in SETTINGS.rounds:
             some = states[: max(2, round(part * len(states)))]
             if part == 0 and some[-1].cost > SETTINGS.behind * some[0].cost:
@@ -271,6 +230,18 @@ class _Fit:
             states[: len(some)] = [search.run(state, steps, first=True) for state in some]
             states.sort(key=lambda state: state.cost)
         return states
+
+    def _start(self, search: FitSearch, start: StartPlacement) -> FitState:
+        """Return the state at a start placement, with derivatives that an earlier fit may have computed."""
+        k = start.shape
+        state = FitState(self.codes[k], self.shapes[k], start.placement)
+        known = {} if self.options.fixed else self.fitter.start_derivatives
+        if k not in known:
+            try:
+                known[k] = search.derivatives(state)
+            except NotPositiveDefiniteError:
+                return state
+        return replace(state, derivatives=known[k])
 
     def _fully(
         self, middle: FitSearch, search: FitSearch, best: FitState, others: list[FitState]
@@ -281,7 +252,9 @@ class _Fit:
             return best, None
         final = search.run(middle.run(begun, SETTINGS.middle_steps, first=False), SETTINGS.last_steps, first=False)
         if not self._late and self._is_poor(*search.shares(final)):
-            again = middle.run(final, SETTINGS.again_steps, first=False, drawn=SETTINGS.drawn_steps)
+            again = middle.with_moved_feature(middle.run(final, 0, first=False), self.features, SETTINGS.again_steps)
+            if self._is_poor(*middle.shares(again)):
+                again = middle.run(again, SETTINGS.again_steps, first=False, drawn=SETTINGS.drawn_steps)
             again = search.run(again, SETTINGS.last_steps, first=False)
             final = again if again.cost < final.cost else final
         for other in others[: SETTINGS.rivals]:

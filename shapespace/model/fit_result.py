@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Shape
+from shapespace.model.decoder import MeshChoice, Shape
 from shapespace.model.latent_space import Codes
 
 
@@ -40,6 +40,16 @@ class FitState:
     cost: float = np.inf  # robust share of scan and model that is not explained, plus the cost of the code
     settled: bool = False  # whether the last step was short enough to be the last one
     moved: float = np.inf  # largest movement of the shape in the last step, as a fraction of the diagonal
+    derivatives: VertexDerivatives | None = None  # derivatives that the next step may use
+
+
+@dataclass(frozen=True, eq=False)
+class VertexDerivatives:
+    """Derivatives of the vertices of a mesh by the movable coordinates of a code."""
+
+    code: FloatArray  # (m,) code at which they were computed
+    fields: FloatArray  # (V, 3, f) derivatives, normalised
+    mesh: MeshChoice
 
 
 @dataclass(frozen=True, eq=False)

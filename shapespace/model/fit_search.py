@@ -15,8 +15,9 @@ from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.derivatives import carried, derivatives, factor_derivatives
+from shapespace.model.feature_search import FeatureSearch
 from shapespace.model.fit_constraints import FitConstraints
-from shapespace.model.fit_result import FitState
+from shapespace.model.fit_result import FitState, VertexDerivatives
 from shapespace.model.pairing import Pairing, Pairs
 from shapespace.model.scan import Scan, independent_points
 from shapespace.model.searched_shapes import SearchedShapes
@@ -101,7 +102,7 @@ class FitSearch:
         self._changes = derivatives if accuracy.mesh is MeshChoice.FINE else factor_derivatives
         self._shapes = SearchedShapes(decoder, reconstruct, deadline, SETTINGS.tolerance, rough=accuracy.rough)
         self.count = 0  # number of shapes computed so far
-        self._fields: tuple[FloatArray, FloatArray] | None = None
+        self._last: VertexDerivatives | None = None
         self._paired = WeakKeyDictionary[Placement, Pairs]()
         self._shared: tuple[FitState, tuple[float, float]] | None = None
 
@@ -116,7 +117,7 @@ class FitSearch:
         With ``first``, the first steps also consider distant points. In the first ``drawn`` steps, unmatched parts of
         both sides attract each other.
         """
-        width, self._fields = np.inf if first else 0.0, None
+        width, self._last = np.inf if first else 0.0, state.derivatives
         for k in range(steps):
             if self._deadline is not None and self._deadline.passed:
                 break
@@ -140,7 +141,18 @@ class FitSearch:
             if state.settled and k >= drawn and width <= SETTINGS.width * sigma:
                 break
         pairs = self._pairs(state)
-        return replace(state, sigma=self._sigma(pairs, state), cost=self._cost(state, pairs))
+        sigma, cost = self._sigma(pairs, state), self._cost(state, pairs)
+        return replace(state, sigma=sigma, cost=cost, derivatives=self._last)
+
+    def with_moved_feature(self, state: FitState, features: FeatureSearch, steps: int) -> FitState:
+        """Move a feature to its most promising place in the scan, as long as the fit improves with so many steps."""
+        for _ in features.images:
+            code = features.another(self._reconstruct, state.code, self._pairs(state), self.constraints.movable)
+            moved = None if code is None else self.start(code, state.placement, state.shape)
+            if moved is None or (moved := self.run(moved, steps, first=False)).cost >= state.cost:
+                break
+            state = moved
+        return state
 
     def normal(self, state: FitState) -> FloatArray:
         """Return the information matrix (m, m) of scan and landmarks about the code, half a Hessian; 0 where fixed.
@@ -219,16 +231,23 @@ class FitSearch:
         """Return the scores (m,) of a code in the prior, angles the shorter way round."""
         return self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
 
-    def _derivatives(self, state: FitState) -> FloatArray:
-        """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
-        if self._fields is not None and np.abs(self._whiten @ (state.code - self._fields[0])).max() <= SETTINGS.kept:
-            return self._fields[1]
+    def derivatives(self, state: FitState) -> VertexDerivatives:
+        """Compute derivatives at a state. Raises NotPositiveDefiniteError."""
         moved = self._changes(self._decoder, state.code)[:, self.constraints.movable]
         fields = self._reconstruct.differential(state.shape, moved.T)
         moves = carried(self._decoder, self._fine, state.shape, fields)
-        found = np.ascontiguousarray(np.moveaxis(moves, 0, -1))
-        self._fields = state.code, found
-        return found
+        return VertexDerivatives(state.code, np.ascontiguousarray(np.moveaxis(moves, 0, -1)), self._accuracy.mesh)
+
+    def _derivatives(self, state: FitState) -> FloatArray:
+        """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
+        last = self._last
+        if (
+            last is None
+            or last.mesh is not self._accuracy.mesh
+            or np.abs(self._whiten @ (state.code - last.code)).max() > SETTINGS.kept
+        ):
+            last = self._last = self.derivatives(state)
+        return last.fields
 
     def _motions(self, pairs: Pairs, state: FitState) -> FloatArray:
         """Return derivatives (n, 3, f + 6 or 7) of the model's points by code, rotation, translation and size."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
@@ -61,12 +62,11 @@ def start_placements(
     again = np.stack([start.placement.rotation for start in kept])
     for k, shape in enumerate(shapes[FIRST:], FIRST):
         tried += _scored(k, shape, some, again, partial=partial, free=free)
-    tree = cKDTree(some)
     # At least one placement of each rotation, so that a wrong rotation with the right code doesn't take all places.
     chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * effort.polished]]
     unique = list({(start.shape, id(start.placement)): start for start in chosen}.values())
     polished = [
-        _polished(start, shapes[start.shape], some, tree, effort.steps, partial=partial, free=free)
+        _polished(start, shapes[start.shape], some, effort.steps, partial=partial, free=free)
         for start in unique[: effort.kept + effort.polished]
     ]
     return _different(polished, effort.count, DIFFERENT / 2)
@@ -104,23 +104,23 @@ def _scored(
 
 
 def _polished(
-    start: StartPlacement, shape: FloatArray, some: FloatArray, tree: cKDTree, steps: int, *, partial: bool, free: bool
+    start: StartPlacement, shape: FloatArray, some: FloatArray, steps: int, *, partial: bool, free: bool
 ) -> StartPlacement:
-    placement, own = start.placement, cKDTree(shape)
+    placement = start.placement
     for _ in range(steps):
-        to_shape, nearest = nearest_points(own, placement.back(some))
-        pairs = [(shape[nearest], some, to_shape)]
+        apart = cdist(placement.back(some), shape)  # faster than trees for so few points
+        pairs = [(shape[apart.argmin(axis=1)], some, apart.min(axis=1))]
         if not partial:
-            to_scan, nearest = nearest_points(tree, placement(shape))
-            pairs.append((shape, some[nearest], to_scan / placement.scale))
+            pairs.append((shape, some[apart.argmin(axis=0)], apart.min(axis=0)))
         here, there, away = (np.concatenate([pair[i] for pair in pairs]) for i in range(3))
         close = away <= np.quantile(away, TRIMMED)
         placement = Placement.between(here[close], there[close], scaled=free)
         if not 0 < placement.scale < np.inf:
             return start
-    score = _trimmed(nearest_points(own, placement.back(some))[0])
+    apart = cdist(placement.back(some), shape)
+    score = _trimmed(apart.min(axis=1))
     if not partial:
-        score = score + _trimmed(nearest_points(tree, placement(shape))[0] / placement.scale)
+        score = score + _trimmed(apart.min(axis=0))
     return StartPlacement(start.shape, placement, float(score))
 
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.fit import SETTINGS
 from shapespace.model.fit_result import FitStatus, Fitted
+from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
 from shapespace.model.options import Landmark
 from shapespace.model.scan import InvalidScanError, scan_of
@@ -100,16 +100,16 @@ def test_a_code_comes_back_from_points_anywhere(plain: Plain, seed: int) -> None
     assert found.solved + found.rough / 3 < 60
 
 
-@pytest.mark.parametrize(("seed", "told"), [(3, True), (1, False), pytest.param(1, True, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("seed", "told"), [(3, True), (2, False), pytest.param(1, True, marks=pytest.mark.long)])
 def test_landmarks_tell_a_ring_how_it_is_turned(ring: ShapeModel, seed: int, told: bool) -> None:
     # A ring turned by 180° or upside down is that of another code: only landmarks tell vertices apart.
     given = Moved.of(ring, seed)
     landmarks = [Landmark(k, given.shape[k].tolist()) for k in (0, 300, 700, 1000, 1400, 1900)]
     found = ring.fit_scan(given.points(), landmarks=landmarks if told else ())
     assert not told or given.error(found) < 5e-3
-    # A bump of two percent of the surface may be found in the wrong place, but then the status says so.
-    assert found.scan.mean < 3e-3 * given.size
-    assert found.status is FitStatus.POOR or found.scan.p95 < 5e-3 * given.size
+    # A bump of two percent of the surface is found, wherever the search began.
+    assert found.status is FitStatus.CONVERGED
+    assert found.scan.p95 < 2e-3 * given.size
 
 
 def test_another_mesh_is_fit_whichever_way_its_faces_are_turned(figure: ShapeModel) -> None:

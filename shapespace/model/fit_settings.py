@@ -1,0 +1,58 @@
+"""Sizes and thresholds of a fit to a scan."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ScanFitSettings:
+    """Sizes and thresholds of a fit. Distances are fractions of the reference's diagonal.
+
+    Attributes:
+        start_shapes, random_shapes: number of start shapes, chosen as far apart as possible from random shapes.
+        shape_points: number of points of a start shape that are compared with the scan.
+        coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
+        rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
+        behind: in the last round, a second start takes part if it costs at most this multiple of the best.
+        middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
+        again_steps: further steps with few points if the result is poor.
+        attempts, attempt_steps: attempts to move a limb of the model to one of the scan, and the iterations of each,
+        drawn_steps: of which this number pulls the limb by target points.
+        units, units_of_part: a scan (of a part) that is this many times larger or smaller than the model's shapes is
+            taken to be in other units, unless the scale is free.
+        missed, unseen: a fit is poor if larger shares of the scan and of the model are far from the other side.
+            Outliers raise only the first share, holes only the second. A limb in the wrong place raises both.
+        missed_of_part: limit of the first share for a scan of a part.
+        restless: a fit has not converged if its last step was longer than this distance.
+        elsewhere: a fit is ambiguous if another fit differs by at least this mean distance,
+        nearly, beside: and costs at most ``nearly`` times as much plus ``beside``.
+        mirrored: a scan counts as mirrored if its mirror image costs less than this share.
+        rivals: maximum number of other fits that are refined to the end.
+    """
+
+    start_shapes: int = 16
+    random_shapes: int = 200
+    shape_points: int = 150
+    coarse_vertices: int = 500
+    fine_vertices: int = 2000
+    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.6, 2), (0.0, 4))
+    behind: float = 1.5
+    middle_steps: int = 8
+    last_steps: int = 6
+    again_steps: int = 10
+    attempts: int = 4
+    attempt_steps: int = 9
+    drawn_steps: int = 4
+    units: float = 3.0
+    units_of_part: float = 20.0
+    missed: float = 0.015
+    unseen: float = 0.008
+    missed_of_part: float = 0.03
+    restless: float = 5e-3
+    elsewhere: float = 0.05
+    nearly: float = 1.1
+    beside: float = 3e-3
+    mirrored: float = 0.6
+    rivals: int = 2
+
+
+SETTINGS = ScanFitSettings()
