@@ -109,7 +109,11 @@ def parser() -> CommandParser:
     report = _add_command(
         commands, "report", "write RUN/report.html, with pictures and figures of all stages that are done"
     )
-    export = _add_command(commands, "export", "finish a run, and write its bundle where it is missing or damaged")
+    export = _add_command(
+        commands,
+        "export",
+        "finish a run, and write its bundle where it is missing or damaged; or add decoder.onnx to a bundle",
+    )
     for command in (status, report, export):
         command.add_argument("run", type=_path, metavar="RUN")
     for command in (run, export):

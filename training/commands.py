@@ -13,8 +13,11 @@ import traceback
 import warnings
 from pathlib import Path
 
-from shapespace.bundle.reader import BundleError
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.bundle.schema import DECODER, MANIFEST
+from shapespace.bundle.writer import add_decoder
 from shapespace.files.limits import in_words
+from shapespace.model.decoder import Decoder
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.learning import ExportError
@@ -152,9 +155,22 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
+    if (arguments.run / MANIFEST).is_file() and not (arguments.run / "config.toml").exists():
+        _add_decoder(arguments.run.resolve())
+        return
     run = _open(arguments.run, arguments.models)
     _execute(run, keep_going=True)
     print(f"{_here(run.bundle)} is ready. Next: {_serving(run.models)}")
+
+
+def _add_decoder(folder: Path) -> None:
+    """Write ``decoder.onnx`` into a bundle that has none, or replace it."""
+    from shapespace.training.learning.decoder_graph import decoder_graph
+
+    bundle = read_bundle(folder)
+    made = decoder_graph(bundle, Decoder(bundle))
+    add_decoder(folder, made)
+    print(f"{_here(folder)} has {DECODER} now" if made.entry else f"{_here(folder)} has no {DECODER}: {made.absent}")
 
 
 def _keep_traceback(arguments: argparse.Namespace) -> Path:
