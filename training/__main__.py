@@ -115,7 +115,7 @@ COMMANDS = (
     _subcommand(
         "export",
         "export",
-        "Finish a run, and write its bundle where it is missing or damaged.",
+        "Finish a run, and write its bundle where it is missing or damaged; or add decoder.onnx to a bundle.",
         [_RUN, _MODELS],
         ["runs/meshes", "runs/meshes --models path/to/models"],
     ),

@@ -13,8 +13,11 @@ from typing import Any
 
 import click
 
-from shapespace.bundle.reader import BundleError
+from shapespace.bundle.reader import BundleError, read_bundle
+from shapespace.bundle.schema import DECODER, MANIFEST
+from shapespace.bundle.writer import add_decoder
 from shapespace.command_line import carry_out, near
+from shapespace.model.decoder import Decoder
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.learning import ExportError
@@ -189,7 +192,20 @@ def report(run: Path) -> None:
 
 @_command
 def export(run: Path, models: Path) -> None:
-    """Finish a run and write its bundle."""
+    """Finish a run and write its bundle, or add ``decoder.onnx`` to a bundle."""
+    if (run / MANIFEST).is_file() and not (run / "config.toml").exists():
+        _add_decoder(run.resolve())
+        return
     opened = _open(run, models)
     _execute(opened, keep_going=True)
     print(f"{near(opened.bundle)} is ready. Next: {_serving(opened.models)}")
+
+
+def _add_decoder(folder: Path) -> None:
+    """Write ``decoder.onnx`` into a bundle that has none, or replace it."""
+    from shapespace.training.learning.decoder_graph import decoder_graph
+
+    bundle = read_bundle(folder)
+    made = decoder_graph(bundle, Decoder(bundle))
+    add_decoder(folder, made)
+    print(f"{near(folder)} has {DECODER} now" if made.entry else f"{near(folder)} has no {DECODER}: {made.absent}")

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from shapespace.bundle.geometry import Geometry, GeometryError
-from shapespace.bundle.schema import CARD, MANIFEST, NAME_PATTERN, VERSION_PATTERN, FileEntry, Manifest
+from shapespace.bundle.schema import (
+    CARD,
+    MANIFEST,
+    NAME_PATTERN,
+    VERSION_PATTERN,
+    DecoderEntry,
+    FileEntry,
+    Manifest,
+)
 from shapespace.files.npz import npz_headers, read_npz
 
 #: Most bytes of a manifest.
@@ -72,7 +80,11 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
     textures = {file: files.pop(file) for file in (manifest.surface.textures if manifest.surface else ())}
     geometry = _geometry(files.pop(manifest.geometry.file), manifest, textures)
     for file, content in files.items():
-        _check_network(file, content)
+        network = _network(file, content)
+        if manifest.decoder and file == manifest.decoder.file:
+            finest = geometry.fine.reference if geometry.fine else geometry.reference
+            _check_decoder(network, manifest.decoder, manifest.latent_dimension, len(finest.vertices))
+        _check_weights(file, network)
     return Bundle(manifest=manifest, digest=found, folder=folder.absolute(), networks=files, **vars(geometry))
 
 
@@ -163,11 +175,32 @@ def _geometry(content: bytes, manifest: Manifest, textures: Mapping[str, bytes])
         raise BundleError(str(error)) from None
 
 
-def _check_network(file: str, content: bytes) -> None:
+def _network(file: str, content: bytes) -> onnx.ModelProto:
     try:
-        model = onnx.load_model_from_string(content)
+        return onnx.load_model_from_string(content)
     except Exception as error:  # protobuf's errors have no common public class
         raise BundleError(f"{file} is not a readable ONNX file: {error}") from None
+
+
+def _check_decoder(model: onnx.ModelProto, decoder: DecoderEntry, latents: int, vertices: int) -> None:
+    """Check the names of the decoder's input and outputs, then their axes."""
+    initialised = {tensor.name for tensor in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in initialised]
+    for role, values, rows in (
+        ("inputs", inputs, {decoder.input: [latents]}),
+        ("outputs", model.graph.output, {decoder.vertices: [vertices, 3], decoder.misfit: []}),
+    ):
+        found = [value.name for value in values]
+        if found != list(rows):
+            raise BundleError(f"{decoder.file} must have the {role} {', '.join(rows)}, not {', '.join(found)}")
+        for value, row in zip(values, rows.values(), strict=True):
+            kind, sizes = value.type.tensor_type, value.type.tensor_type.shape.dim
+            fixed = [size.dim_value for size in sizes]
+            if kind.elem_type != onnx.TensorProto.FLOAT or len(sizes) != 1 + len(row) or fixed != [0, *row]:
+                raise BundleError(f"{decoder.file}: {value.name} must be float32 {['n', *row]}")
+
+
+def _check_weights(file: str, model: onnx.ModelProto) -> None:
     functions = (node for function in model.functions for node in function.node)
     for tensor in [*_tensors_of_graph(model.graph), *_tensors_of_nodes(functions)]:
         name = tensor.name or "a tensor"

@@ -32,6 +32,18 @@ class Network(_Strict):
     output: str
 
 
+class DecoderEntry(_Strict):
+    """The ONNX file of the whole way from latents to the vertices of drafts, with the names of input and outputs."""
+
+    file: FileName
+    input: str
+    #: (n, V, 3) vertices of the fine mesh, aligned, in the user's units, and (n,) relative misfit.
+    vertices: str
+    misfit: str
+    #: Largest distance from a draft that the export measured, as a share of the diagonal.
+    error: NonNegativeFloat
+
+
 class _Range(_Strict):
     name: str
     start: int = Field(ge=0)
@@ -135,6 +147,9 @@ class Manifest(_Strict):
     scale: PositiveFloat
     combiner: Network
     start: Network | None
+    decoder: DecoderEntry | None = None
+    #: Why there is no decoder, if the export left it out.
+    without_decoder: str | None = None
     geometry: GeometryFile
     surface: AttributesEntry | None = None
     onnx_tolerance: Tolerance
@@ -155,7 +170,7 @@ class Manifest(_Strict):
         if [factor.start for factor in self.factors] != stops[:-1] or stops[-1] != m or sorted(set(stops)) != stops:
             raise ValueError(f"the factors must split the {m} latents into consecutive, non-empty ranges")
         named = [network.file for network in (*self.factors, self.combiner)] + [self.geometry.file]
-        named += [self.start.file] if self.start else []
+        named += [each.file for each in (self.start, self.decoder) if each]
         named += self.surface.textures if self.surface else []
         named += [CARD] if CARD in self.files else []
         if sorted(named) != sorted(self.files):
@@ -209,6 +224,7 @@ ARRAYS = {
 #: Names with which files are written. The reader uses the names in the manifest.
 COMBINER = Network(file="combiner.onnx", input="factors", output="nric")
 START = Network(file="start.onnx", input="latent", output="vertices")
+DECODER = "decoder.onnx"
 GEOMETRY = GeometryFile(file="geometry.npz")
 
 

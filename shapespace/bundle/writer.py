@@ -18,10 +18,12 @@ from shapespace.bundle.reader import BundleError, read_bundle, read_files
 from shapespace.bundle.schema import (
     CARD,
     COMBINER,
+    DECODER,
     GEOMETRY,
     MANIFEST,
     SCHEMA_VERSION,
     START,
+    DecoderEntry,
     FileEntry,
     Manifest,
     Origin,
@@ -34,6 +36,15 @@ from shapespace.files.npz import npz_bytes
 from shapespace.shell.energy import Material
 
 
+@dataclass(frozen=True)
+class ExportedDecoder:
+    """Content and entry of ``decoder.onnx``, or the reason why a bundle has none."""
+
+    content: bytes | None
+    entry: DecoderEntry | None
+    absent: str | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Networks:
     """Contents of the ONNX files of a bundle. Their batch size n is dynamic."""
@@ -41,6 +52,7 @@ class Networks:
     factors: Sequence[bytes]  # network ψ_j of each factor: latents of the factor to lengths and angles (n, 2E)
     combiner: bytes  # lengths and angles of all factors (n, J, 2E) to lengths and angles (n, 2E)
     start: bytes | None = None  # latents (n, m) to start vertices (n, V, 3) of Gauss–Newton; optional
+    decoder: ExportedDecoder | None = None  # latents to the vertices of drafts; optional
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +105,7 @@ def require_replaceable(folder: Path, names: Iterable[str] = ()) -> None:
     except (OSError, ValueError, LookupError, TypeError):
         own = set()
     if {COMBINER.file, GEOMETRY.file, factor_network(0).file} <= present:
-        own |= {MANIFEST, CARD, COMBINER.file, GEOMETRY.file, START.file, *names}
+        own |= {MANIFEST, CARD, COMBINER.file, GEOMETRY.file, START.file, DECODER, *names}
         own |= {factor_network(j).file for j in range(len(present))}
     if others := sorted(present - own):
         named = ", ".join(map(clipped, others[:3])) + (", …" if len(others) > 3 else "")
@@ -116,9 +128,12 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
         files[START.file] = networks.start
     if geometry.surface:
         files |= geometry.surface.textures
+    manifest = _manifest(facts, geometry, files)
+    if networks.decoder:
+        manifest = _with_decoder(manifest, files, networks.decoder)
     folder = models / facts.name / facts.version
     require_replaceable(folder, files)
-    _replace(folder, files, _manifest(facts, geometry, files), geometry)
+    _replace(folder, files, manifest, geometry)
     return folder
 
 
@@ -128,6 +143,24 @@ def add_card(folder: Path) -> None:
     _replace(folder, read_files(folder, bundle.manifest), bundle.manifest, bundle)
 
 
+def add_decoder(folder: Path, decoder: ExportedDecoder) -> None:
+    """Write ``decoder.onnx`` into a bundle and its manifest; all networks stay. Raises BundleError or OSError."""
+    bundle = read_bundle(folder)
+    manifest = bundle.manifest
+    files = read_files(folder, manifest)
+    if manifest.decoder:
+        files.pop(manifest.decoder.file)
+    _replace(folder, files, _with_decoder(manifest, files, decoder), bundle)
+
+
+def _with_decoder(manifest: Manifest, files: dict[str, bytes], decoder: ExportedDecoder) -> Manifest:
+    if decoder.content is not None:
+        files[DECODER] = decoder.content
+    listed = {name: entry(files[name]) for name in sorted(files)}
+    changes = {"decoder": decoder.entry, "without_decoder": decoder.absent, "files": listed}
+    return Manifest.model_validate(dict(manifest) | changes, by_name=True)
+
+
 def _replace(folder: Path, files: Mapping[str, bytes], manifest: Manifest, geometry: Geometry) -> None:
     """Write or replace a bundle, with its card."""
     files = {**files, CARD: card(manifest, geometry)}
@@ -135,7 +168,7 @@ def _replace(folder: Path, files: Mapping[str, bytes], manifest: Manifest, geome
     listed = manifest.model_copy(update={"files": entries})
     text = json.dumps(listed.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
     with replaced_folder(folder) as part:
-        for name, content in (files | {MANIFEST: text.encode()}).items():
+        for name, content in ({**files, MANIFEST: text.encode()}).items():
             with synced_file(part / name) as file:
                 file.write(content)
 

@@ -15,6 +15,8 @@ angle γ is needed. Its cosine follows from the law of cosines, ``cos γ = (b² 
 ``sin γ/2 = √((1 − cos γ)/2)`` and ``cos γ/2 = √((1 + cos γ)/2)``, without a trigonometric function.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -25,6 +27,35 @@ from shapespace.coordinates import quaternions
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_normals
 from shapespace.solve.cholesky import Backend, Factorisation, SymmetricPattern, analyse
+
+
+class WeightedGraph(NamedTuple):
+    """Nodes, and edges with weights (n,): the Laplacian of a least-squares equation."""
+
+    size: int
+    tails: IntArray
+    heads: IntArray
+    weights: FloatArray
+
+
+class FramePlan(NamedTuple):
+    """All that `FrameIntegration` computes from the connectivity and the reference, see there.
+
+    Side k of face f, opposite to its corner k, has the index ``k F + f``.
+    """
+
+    order: IntArray  # (F,) faces, sorted by their depth in the tree
+    root_frames: FloatArray  # (4, R) frames of the first R of these faces, which are roots
+    left_sides: IntArray  # (H,) the side that each hinge is of its left face
+    right_sides: IntArray  # (H,) the side that each hinge is of its right face
+    tree: IntArray  # (F − R,) the hinge to the parent of each other face
+    direction: FloatArray  # (F − R,) 1, or −1 where the rotation at this hinge is reversed
+    rounds: list[tuple[int, IntArray]]  # products along the tree: first face in the order, and ancestors there
+    others: IntArray  # (O,) hinges outside the tree
+    misfits: sparse.csr_array  # (F, O) right-hand side of the rotations from the misfits at these hinges
+    divergence: sparse.csr_array  # (V, 3F) right-hand side of the positions from the vectors of the sides
+    rotations: WeightedGraph  # left-hand side of the rotations of faces
+    positions: WeightedGraph  # left-hand side of the positions of vertices
 
 
 class FrameIntegration:
@@ -53,6 +84,24 @@ class FrameIntegration:
         self._poisson_equation(reference, backend)
         self._rotation_equation(reference, backend)
 
+    @property
+    def plan(self) -> FramePlan:
+        """What other runtimes need to compute the same shapes."""
+        return FramePlan(
+            order=np.argsort(self._place),
+            root_frames=self._root_frames,
+            left_sides=self._left_sides,
+            right_sides=self._right_sides,
+            tree=self._tree,
+            direction=self._direction,
+            rounds=self._rounds,
+            others=self._others,
+            misfits=self._misfits,
+            divergence=self._divergence,
+            rotations=self._rotations,
+            positions=self._positions,
+        )
+
     def _hinges(self, children: IntArray, parents: IntArray) -> None:
         """Find the side that each hinge is of its two faces, and the hinge from each face to its parent."""
         c = self._connectivity
@@ -77,7 +126,8 @@ class FrameIntegration:
         self._divergence = _differences(c.vertex_count, tails, heads, weights)
         anchor = self.ANCHOR * weights.mean()
         self._anchored = anchor * reference.vertices
-        self._poisson = _laplacian(c.vertex_count, tails, heads, weights, anchor, backend)
+        self._positions = WeightedGraph(c.vertex_count, tails, heads, weights)
+        self._poisson = _laplacian(self._positions, anchor, backend)
 
     def _rotation_equation(self, reference: TriangleMesh, backend: Backend) -> None:
         """Do the same for the small rotations of faces. An angle has its weight in the norm of lengths and angles."""
@@ -87,9 +137,9 @@ class FrameIntegration:
         others = self._others
         self._left, self._right = left[others], right[others]
         self._misfits = _differences(self._count, self._left, self._right, weights[others])
+        self._rotations = WeightedGraph(self._count, left, right, weights)
         if len(others):
-            anchor = self.ANCHOR * weights.mean()
-            self._laplacian = _laplacian(self._count, left, right, weights, anchor, backend)
+            self._laplacian = _laplacian(self._rotations, self.ANCHOR * weights.mean(), backend)
 
     @np.errstate(divide="ignore", over="ignore", invalid="ignore")
     def __call__(self, z: FloatArray) -> FloatArray:
@@ -165,10 +215,9 @@ def _differences(size: int, tails: IntArray, heads: IntArray, weights: FloatArra
     return sparse.csr_array((np.concatenate([-weights, weights]), places), shape=(size, len(tails)))
 
 
-def _laplacian(
-    size: int, tails: IntArray, heads: IntArray, weights: FloatArray, anchor: float, backend: Backend
-) -> Factorisation:
+def _laplacian(graph: WeightedGraph, anchor: float, backend: Backend) -> Factorisation:
     """Factorise the Laplacian of a weighted graph, with ``anchor`` added to its diagonal."""
+    size, tails, heads, weights = graph
     pattern = SymmetricPattern(size, np.concatenate([tails, heads, tails]), np.concatenate([tails, heads, heads]))
     entries = pattern.scatter(np.concatenate([weights, weights, -weights]))
     entries[pattern.diagonal] += anchor

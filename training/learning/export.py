@@ -1,7 +1,5 @@
 """Export trained networks as the ONNX files of a bundle, and check that ONNX and PyTorch agree."""
 
-import logging
-import warnings
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -17,49 +15,29 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from shapespace.bundle.geometry import Geometry
-from shapespace.bundle.reader import BundleError
+from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance, factor_network
 from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.model.decoder import ModelFailedError
+from shapespace.model.decoder import Decoder, ModelFailedError
 from shapespace.model.latent_space import NotFiniteError
-from shapespace.model.shape_model import load
 from shapespace.shell.energy import Material
 from shapespace.training.learning import ExportError
 from shapespace.training.learning.composite import Composite
+from shapespace.training.learning.decoder_graph import decoder_graph, exported
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.naming import NamingError, bundle_names
 from shapespace.training.learning.networks import StartNetwork, predict
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 
-OPSET = 18
 #: Number of random codes, and of codes of training shapes, at which ONNX and PyTorch are compared.
 CHECKED = 64
 
 
 def to_onnx(network: nn.Module, example: Tensor, names: Network) -> bytes:
     """Return an ONNX file of a network, with the names that bundles use for its input and output."""
-    network.eval()
-    # Without gradients, networks compute by plain gathers and sums, which exist in ONNX.
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program: Any = torch.onnx.export(
-            network,
-            (example,),
-            input_names=[names.input],
-            output_names=[names.output],
-            dynamic_shapes=({0: torch.export.Dim("n", min=1)},),
-            opset_version=OPSET,
-            dynamo=True,
-            verbose=False,
-        )
-    model: onnx.ModelProto = program.model_proto
-    # The metadata of every node contain paths of the exporting machine's source files.
-    for node in model.graph.node:
-        node.ClearField("metadata_props")
-        node.ClearField("doc_string")
-    model.ClearField("metadata_props")
+    model = exported(network, example, [names.input], [names.output])
     _narrow(model.graph)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
@@ -93,7 +71,6 @@ def difference(composite: Composite, networks: Networks, latents: Tensor, norm: 
 
 
 def _networks(composite: Composite, start: StartNetwork | None, latents: Tensor) -> Networks:
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     some = latents[:2]
     return Networks(
         factors=[
@@ -168,9 +145,11 @@ def export(
     try:
         # Drafts are measured as they are served, which needs a bundle: a first one in a temporary folder.
         with TemporaryDirectory() as folder:
-            facts = replace(
-                facts, draft_error=load(write_bundle(Path(folder), facts, networks, geometry)).decoder.draft_error()
-            )
+            first = write_bundle(Path(folder), facts, networks, geometry)
+            decoder = Decoder(read_bundle(first))
+            facts = replace(facts, draft_error=decoder.draft_error())
+            if settings.decoder:
+                networks = replace(networks, decoder=decoder_graph(read_bundle(first), decoder))
         return write_bundle(models, facts, networks, geometry)
     except ValidationError as error:
         fault = error.errors(include_url=False, include_input=False)[0]

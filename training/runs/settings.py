@@ -186,6 +186,8 @@ class ExportSettings(SettingsTable):
     """Whether the bundle stores the errors of modes and networks at the training shapes, and corrects them at the codes
     of these shapes. Other codes change very little. The bundle grows by a byte for each length and angle of each
     shape."""
+    decoder: bool = True
+    """Whether the bundle has ``decoder.onnx``, one graph from codes to vertices for other programs than the server."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest allowed relative difference between the ONNX and the PyTorch networks, in the weighted norm."""
     faces: Axis | None = None
