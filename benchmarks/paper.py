@@ -73,7 +73,8 @@ def main() -> None:
     for name in given.names:
         record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
         evaluation = json.loads((record / "evaluation.json").read_text())
-        measure(Run(given.out / name, *load(record / "config.toml"), given.out / "models"), evaluation)
+        config = record / "config.toml"
+        measure(Run(given.out / name, *load(config, stored=config), given.out / "models"), evaluation)
         file.parent.mkdir(exist_ok=True)
         file.write_text(json.dumps(evaluation, indent=2) + "\n", encoding="utf-8")
 

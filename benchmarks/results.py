@@ -142,7 +142,8 @@ def compactness(run: RunDirectory, config: Config) -> dict[str, Any]:
     m = len(sparse)
     counts = [-(-m // 2), m]
     linear = PrincipalComponents.of(shapes, reference.vertices)
-    space = ShellSpace(reference.with_vertices(mean), config.shell_material)
+    centre, first_step = reference.with_vertices(mean), config.exponential.first_step
+    space = ShellSpace(centre, config.shell_material, first_step=first_step)
     fields = logarithms(space, mean, shapes, run.decomposition.read()["log_steps"]).fields
 
     def explained(span: FloatArray) -> list[float]:

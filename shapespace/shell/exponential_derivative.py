@@ -52,7 +52,7 @@ class ExponentialDerivative:
             self._ahead.append(ahead)
             self._here.append(_stiffness(previous, current, following))
             self._factors.append(_factorised(ahead))
-        self._first = None if path.before is None else _CentredStep(path)
+        self._first = None if path.before is None else _CentredStep(path, path.before)
 
     def push_forward(self, velocities: FloatArray) -> FloatArray:
         """Compute ``D exp(v) δv`` (n, V, 3), the changes of the last shape for changes δv of the velocity (n, V, 3)."""
@@ -87,12 +87,11 @@ class ExponentialDerivative:
 class _CentredStep:
     """The derivative of X_1 by the stride v/K, for a centred first step."""
 
-    def __init__(self, path: DiscretePath) -> None:
-        assert path.before is not None
+    def __init__(self, path: DiscretePath, before: FloatArray) -> None:
         self._start = path.vertices[0]
-        self._following = 2 * path.vertices[1] - 2 * self._start + path.before
+        self._following = 2 * path.vertices[1] - 2 * self._start + before
         start = path.space.point(self._start)
-        self._behind = _coupling(path.space.point(path.before), start)
+        self._behind = _coupling(path.space.point(before), start)
         self._ahead = _coupling(start, path.space.point(self._following))
         self._factor = _factorised(self._ahead)
         self._here, self._there = rigid_motions(self._start), rigid_motions(self._following)

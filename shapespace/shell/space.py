@@ -35,7 +35,7 @@ from shapespace.solve.preconditioner import Preconditioner
 
 #: Tolerance of equations F = 0, for ``sqrt(Fᵀ A⁻¹ F)``: the length in the metric of a further Newton step.
 TOLERANCE = 1e-9
-#: How an exponential takes its first step from X_0: straight on by d/K, as in the paper, or centred. See ``exponential``.
+#: The first step of an exponential: straight on by d/K, as in the paper, or centred. See ``exponential``.
 FirstStep = Literal["centred", "paper"]
 
 

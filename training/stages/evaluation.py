@@ -15,17 +15,22 @@ from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWa
 
 def measure_run(run: Run) -> None:
     """Write ``evaluation.json`` and ``gallery.npz``."""
+    from shapespace.training.learning.baselines import Exact
     from shapespace.training.learning.evaluation import evaluate
 
     directory = run.directory
 
-    def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
+    def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> Exact:
         folder = directory.exact / name
         run.draw(folder, latents, f"exact shapes, {name}", shorten=False, collection=collection)
         samples = read(folder)
-        result = np.full((len(latents), samples.nric.shape[1]), np.nan, dtype=np.float32)
-        result[samples.index] = samples.nric
-        return result
+
+        def each(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            result = np.full((len(latents), *values.shape[1:]), np.nan, dtype=np.float32)
+            result[samples.index] = values
+            return result
+
+        return Exact(each(samples.nric), each(samples.vertices))
 
     figures, gallery = evaluate(learner_of(run), exact)
     if directory.ingest.exists():

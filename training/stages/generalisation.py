@@ -19,12 +19,15 @@ def measure_generalisation(run: Run) -> None:
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
     shapes, original = given["vertices"], given["original"]
-    count = int(original.max()) + 1
+    count, first_step = int(original.max()) + 1, run.config.exponential.first_step
     some = folds(count)[: 1 if count >= 2 * FOLDS else None]
     facts: dict[str, Any]
     try:
         found = joined(
-            [held_out(reference, shapes, each, None, settings, material, original=original) for each in some]
+            [
+                held_out(reference, shapes, each, None, settings, material, original=original, first_step=first_step)
+                for each in some
+            ]
         )
     except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use
         facts = {"failed": str(error)}
