@@ -103,7 +103,8 @@ def load(path: Path, data: Path | None = None, stored: Path | None = None) -> tu
     config, text = _load(path, data)
     if "first_step" in config.exponential.model_fields_set:
         return config, text
-    if stored and stored.is_file() and "first_step" not in _load(stored)[0].exponential.model_fields_set:
+    old = bool(stored and stored.is_file()) and "first_step" not in _load(stored)[0].exponential.model_fields_set
+    if old or config.collection.generator == "freaky-torus":  # a formula, without exponentials
         return config.model_copy(update={"exponential": ExponentialSettings(first_step="paper")}), text
     document: Any = tomlkit.parse(text)
     document.setdefault("exponential", tomlkit.table())["first_step"] = config.exponential.first_step
