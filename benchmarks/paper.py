@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.pages import ROOT
+from benchmarks.pages import ROOT, write_figures
 from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
 from shapespace.training.learning.networks import predict
 from shapespace.training.runs.config import load
@@ -75,8 +75,7 @@ def main() -> None:
         evaluation = json.loads((record / "evaluation.json").read_text())
         config = record / "config.toml"
         measure(Run(given.out / name, *load(config, stored=config), given.out / "models"), evaluation)
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(json.dumps(evaluation, indent=2) + "\n", encoding="utf-8")
+        write_figures(file, evaluation)
 
 
 if __name__ == "__main__":

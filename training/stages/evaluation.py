@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.runs.sampling import DONE, Collection, parts, read
 from shapespace.training.space.generalisation import RANDOM, PrincipalComponents, to_nearest
 from shapespace.training.stages.networks import learner_of
@@ -37,11 +38,11 @@ def measure_run(run: Run) -> None:
         figures["prolongation"] = directory.ingest.read().get("prolongation")
     unseen = directory.generalisation.read_if_written()
     if unseen and "failed" not in unseen:
-        figures["generalisation"] = unseen
+        figures["generalisation"] = {name: fact for name, fact in unseen.items() if name != MADE_BY}
     if not run.by_design:
         figures |= compactness_and_specificity(directory)
     directory.gallery.write(**gallery)
-    directory.evaluation.write(figures)
+    directory.evaluation.write({MADE_BY: made_by()} | figures)
 
 
 def compactness_and_specificity(run: RunDirectory) -> dict[str, dict[str, float]]:

@@ -4,6 +4,7 @@ from typing import Any
 
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.space.generalisation import FOLDS, folds, held_out, joined, summary
 from shapespace.training.space.modes import ModeError
 from shapespace.training.stages.stage import Run, Stage, StageWarning
@@ -47,7 +48,7 @@ def measure_generalisation(run: Run) -> None:
             "not_stuck": {name: summary(rows[-1][ended]) for name, rows in away.items() if ended.any()},
             "worst": str(given["names"][number]),
         }
-    directory.generalisation.write(facts)
+    directory.generalisation.write({MADE_BY: made_by()} | facts)
     directory.log("found", **facts)
 
 

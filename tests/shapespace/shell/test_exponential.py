@@ -36,7 +36,7 @@ def test_every_step_of_the_exponential_solves_its_equation(space, mesh, velocity
 
 @pytest.mark.parametrize(("mesh", "pose"), [("torus", 1.3)], indirect=True)
 def test_a_centred_first_step_is_a_hundred_times_closer_to_the_limit(mesh, velocity):
-    """Squared distances fall like 1/K² with the paper's step. Centred ones start far below, and fall faster at first."""
+    """Squared distances fall like 1/K² with the paper's step. Centred ones start far below and fall faster."""
     centred, paper = (ShellSpace(mesh, Material(eta=1e-3), first_step=step) for step in ("centred", "paper"))
     limit = exponential(centred, mesh.vertices, velocity, 128).vertices[-1]
 
