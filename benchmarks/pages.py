@@ -7,7 +7,7 @@ from typing import Any
 
 import jinja2
 
-from shapespace.training.report.number_format import r2
+from shapespace.training.report.number_format import r2, short_of
 from shapespace.training.runs.provenance import MADE_BY, made_by
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,6 +43,7 @@ def render(name: str, **values: Any) -> str:
         autoescape=False,  # noqa: S701 - Markdown of our own
     )
     environment.filters["r2"] = r2
+    environment.filters["short_of"] = short_of
     environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
     return environment.get_template(f"{name}.md.jinja").render(**values)
 

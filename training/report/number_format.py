@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-#: Most decimals of a coefficient of determination.
+#: Most decimals of a number that is close to a whole.
 MOST_DIGITS = 15
 
 
@@ -26,10 +26,12 @@ def figure(value: Any) -> str:
 
 def r2(value: float | None) -> str:
     """Format a coefficient of determination with four decimals, or with as many as keep it from rounding up to 1."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    digits = 4
-    while value < 1 and digits < MOST_DIGITS and float(f"{value:.{digits}f}") >= 1:
+    return "–" if value is None or not math.isfinite(value) else short_of(value, 4)
+
+
+def short_of(value: float, digits: int, whole: float = 1.0) -> str:
+    """Format a number with some decimals, or with as many as keep it from rounding up to the whole."""
+    while value < whole and digits < MOST_DIGITS and float(f"{value:.{digits}f}") >= whole:
         digits += 1
     return f"{value:.{digits}f}"
 
