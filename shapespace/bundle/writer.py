@@ -149,8 +149,8 @@ def entry(content: bytes) -> FileEntry:
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:
     reference = geometry.reference
-    same = ("name", "version", "licence", "title", "description", "eta_reconstruction", "scale")
-    same += ("exponential_steps", "exponential_first_step")
+    same = ["name", "version", "licence", "title", "description", "eta_reconstruction", "scale"]
+    same += ["exponential_steps", "exponential_first_step"]
     return Manifest.model_validate({
         "schema_version": SCHEMA_VERSION,
         **{name: getattr(facts, name) for name in (*same, "draft_error", "origin")},

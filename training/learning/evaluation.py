@@ -220,8 +220,9 @@ def against_limit(learner: Learner, seed: int, count: int, exact: ExactShapes) -
         return None
     norm = WeightedNorm.of(collection.reference, config.evaluation.eta)
     answers = predict(learner.main(), torch.as_tensor(some[rows], dtype=torch.float32)).numpy()
-    reference, limit = collection.reference, wanted.vertices[rows]
-    away = np.linalg.norm(align(shot.vertices[rows], limit) - limit, axis=2) / reference.diagonal
+    reference = collection.reference
+    ends, limit = (found.vertices[rows].astype(np.float64) for found in (shot, wanted))
+    away = np.linalg.norm(align(ends, limit) - limit, axis=2) / reference.diagonal
     missed = reconstruct(reference, config.export.eta_reconstruction, answers, limit)[2]
     return {
         "steps": collection.limit.steps,

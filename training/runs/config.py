@@ -103,12 +103,20 @@ def load(path: Path, data: Path | None = None, stored: Path | None = None) -> tu
     config, text = _load(path, data)
     if "first_step" in config.exponential.model_fields_set:
         return config, text
-    old = bool(stored and stored.is_file()) and "first_step" not in _load(stored)[0].exponential.model_fields_set
-    if old or config.collection.generator == "freaky-torus":  # a formula, without exponentials
+    formula = config.collection.generator == "freaky-torus"  # without exponentials
+    if formula or (stored is not None and _is_of_0_2(stored)):
         return config.model_copy(update={"exponential": ExponentialSettings(first_step="paper")}), text
     document: Any = tomlkit.parse(text)
     document.setdefault("exponential", tomlkit.table())["first_step"] = config.exponential.first_step
     return config, tomlkit.dumps(document)
+
+
+def _is_of_0_2(stored: Path) -> bool:
+    """Return whether a run directory has a configuration, without a first step."""
+    try:
+        return "first_step" not in tomllib.loads(read_plain(stored).decode()).get("exponential", {})
+    except (OSError, ValueError):
+        return False
 
 
 def _load(path: Path, data: Path | None = None) -> tuple[Config, str]:

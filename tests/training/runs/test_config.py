@@ -113,6 +113,9 @@ def test_a_run_of_version_0_2_keeps_the_papers_first_step_and_a_new_one_names_it
     stored.write_text(mine.read_text())  # as version 0.2 did
     old, kept = load(mine, stored=stored)
     assert (old.exponential.first_step, kept) == ("paper", mine.read_text())
+    stored.write_text("damaged [")
+    assert load(mine, stored=stored)[0] == new, "as if there were no run"
+    stored.write_text(mine.read_text())
     mine.write_text(f'{mine.read_text()}\n[exponential]\nfirst_step = "centred"\n')
     asked, text = load(mine, stored=stored)
     assert (asked.exponential.first_step, text) == ("centred", mine.read_text())
