@@ -37,7 +37,8 @@ def record(name: str) -> dict[str, Any]:
     folder = ROOT / "runs" / name
     found: dict[str, Any] = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
     found["evaluation"] = studies.EMPTY | found["evaluation"]
-    return found | {"config": load(folder / "config.toml")[0]}
+    config = folder / "config.toml"
+    return found | {"config": load(config, stored=config)[0]}
 
 
 def add_paper(found: dict[str, Any], again: dict[str, Any]) -> None:

@@ -5,7 +5,6 @@ shapes in FOLDER/NAME.npz, as ``vertices`` (n, V, 3) in the order of the bundle.
 """
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -276,7 +275,7 @@ def measure(name: str, model: ShapeModel, unseen: FloatArray | None, count: int)
 
 def write_page() -> None:
     """Write the page from all stored figures."""
-    files = {file.stem: json.loads(file.read_text(encoding="utf-8")) for file in sorted(FIGURES.glob("*.json"))}
+    files = {file.stem: pages.read_figures(file) for file in sorted(FIGURES.glob("*.json"))}
     every: dict[tuple[str, str], list[Row]] = {}
     for name, found in files.items():
         for row in (Row(**each) for each in found):
@@ -343,8 +342,7 @@ def main() -> None:
                 with np.load(given.data / f"{name}.npz", allow_pickle=False) as arrays:
                     unseen = arrays["vertices"]
             found = measure(name, load(bundles[name]), unseen, given.count)
-            every = json.dumps([asdict(row) for row in found], indent=1)
-            (FIGURES / f"{name}.json").write_text(every, encoding="utf-8")
+            pages.write_figures(FIGURES / f"{name}.json", [asdict(row) for row in found])
     write_page()
 
 

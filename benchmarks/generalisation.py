@@ -6,7 +6,6 @@ folds has its figures in ``runs/folds/``, and is not measured again.
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +114,7 @@ def rows(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[list
 
 def write_page() -> None:
     """Write the page from all stored figures."""
-    done = {each: json.loads(path.read_text()) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
+    done = {each: pages.read_figures(path) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
     plain = {name: found for name, found in done.items() if not name.endswith(MIRRORED)}
     images = {name.removesuffix(MIRRORED): found for name, found in done.items() if "mirrored_components" in found}
     page = PAGE.format(
@@ -143,8 +142,7 @@ def main() -> None:
         file = FIGURES / f"{name}.json"
         if not file.exists():
             found = measure(name, given.data, given.out)
-            file.parent.mkdir(exist_ok=True)
-            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+            pages.write_figures(file, found)
         write_page()
 
 

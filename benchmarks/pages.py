@@ -1,13 +1,30 @@
-"""The pages in docs/measurements: their folder, their templates, and their tables in Markdown."""
+"""The pages in docs/measurements: their folder, templates and tables, and the files of figures that they show."""
 
+import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
+from shapespace.training.report.number_format import r2, short_of
+from shapespace.training.runs.provenance import MADE_BY, made_by
+
 ROOT = Path(__file__).resolve().parents[1]
 MEASUREMENTS = ROOT / "docs" / "measurements"
+
+
+def read_figures(file: Path) -> Any:
+    """Read the figures of a file in ``runs``: a mapping, or a list of rows."""
+    found = json.loads(file.read_text(encoding="utf-8"))
+    return found["rows"] if found.keys() == {MADE_BY, "rows"} else found
+
+
+def write_figures(file: Path, found: dict[str, Any] | list[Any]) -> None:
+    """Write a mapping or a list of rows to a file in ``runs``, with what made it."""
+    file.parent.mkdir(exist_ok=True)
+    facts = {MADE_BY: made_by()} | (found if isinstance(found, dict) else {"rows": found})
+    file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def write(name: str, text: str) -> None:
@@ -25,6 +42,8 @@ def render(name: str, **values: Any) -> str:
         keep_trailing_newline=True,
         autoescape=False,  # noqa: S701 - Markdown of our own
     )
+    environment.filters["r2"] = r2
+    environment.filters["short_of"] = short_of
     environment.filters["percent"] = lambda share, digits=2: f"{100 * share:.{digits}f} %"
     return environment.get_template(f"{name}.md.jinja").render(**values)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.pages import ROOT
+from benchmarks.pages import ROOT, write_figures
 from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
 from shapespace.training.learning.networks import predict
 from shapespace.training.runs.config import load
@@ -73,9 +73,9 @@ def main() -> None:
     for name in given.names:
         record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
         evaluation = json.loads((record / "evaluation.json").read_text())
-        measure(Run(given.out / name, *load(record / "config.toml"), given.out / "models"), evaluation)
-        file.parent.mkdir(exist_ok=True)
-        file.write_text(json.dumps(evaluation, indent=2) + "\n", encoding="utf-8")
+        config = record / "config.toml"
+        measure(Run(given.out / name, *load(config, stored=config), given.out / "models"), evaluation)
+        write_figures(file, evaluation)
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ def main() -> None:
     parser.add_argument("config", type=Path)
     parser.add_argument("run", type=Path)
     given = parser.parse_args()
-    run = Run(given.run, *load(given.config), given.run / "models")
+    run = Run(given.run, *load(given.config, stored=given.run / "config.toml"), given.run / "models")
     studio = Studio.of(Record(run.directory))
     if studio is None:
         raise SystemExit("Nothing to draw with: install embreex.")

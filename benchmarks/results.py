@@ -6,7 +6,6 @@ written next to the runs, since they contain the collections' geometry.
 """
 
 import argparse
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.evaluation import r_squared
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
+from shapespace.training.report.number_format import r2
 from shapespace.training.runs import workers
 from shapespace.training.runs.config import Config, load, parse
 from shapespace.training.runs.directory import RunDirectory
@@ -142,7 +142,8 @@ def compactness(run: RunDirectory, config: Config) -> dict[str, Any]:
     m = len(sparse)
     counts = [-(-m // 2), m]
     linear = PrincipalComponents.of(shapes, reference.vertices)
-    space = ShellSpace(reference.with_vertices(mean), config.shell_material)
+    centre, first_step = reference.with_vertices(mean), config.exponential.first_step
+    space = ShellSpace(centre, config.shell_material, first_step=first_step)
     fields = logarithms(space, mean, shapes, run.decomposition.read()["log_steps"]).fields
 
     def explained(span: FloatArray) -> list[float]:
@@ -229,8 +230,9 @@ def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
 
 def leading(found: dict[str, Any]) -> str:
     """Return cells of composite, one factor and kernel, with the largest R² in bold."""
-    cells = [f"{found['r2'][model]['total']:.4f}" for model in ("composite", "monolithic", "kernel")]
-    return " | ".join(f"**{cell}**" if cell == max(cells) else cell for cell in cells)
+    values = [found["r2"][model]["total"] for model in ("composite", "monolithic", "kernel")]
+    best = r2(max(values))
+    return " | ".join(f"**{best}**" if r2(value) == best else r2(value) for value in values)
 
 
 def joint_exponentials(row: dict[str, Any]) -> list[int]:
@@ -278,12 +280,12 @@ def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
 def write_page() -> None:
     """Write the page from all stored figures."""
     rows = {
-        name: json.loads(file.read_text())
+        name: pages.read_figures(file)
         for name in (*COLLECTIONS, *CONTRASTS)
         if (file := FIGURES / f"{name}.json").exists()
     }
     for row in rows.values():
-        row["evaluation"] = studies.EMPTY | row["evaluation"]
+        row["evaluation"] = studies.EMPTY | {"limit": None} | row["evaluation"]
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
         plot_samples(some, pages.MEASUREMENTS / "results-samples.png")
@@ -314,8 +316,7 @@ def main() -> None:
         if not file.exists():
             print(f"\n{name}")
             found = figures(name, open_run(name, given.data, given.out))
-            file.parent.mkdir(exist_ok=True)
-            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+            pages.write_figures(file, found)
         write_page()
 
 

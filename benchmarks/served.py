@@ -7,7 +7,6 @@ can be continued. ``python -m benchmarks.fit --data OUT/models`` fits scans of t
 """
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -219,20 +218,19 @@ def main() -> None:
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
-        found = json.loads(file.read_text()) if file.exists() else []
+        found = pages.read_figures(file) if file.exists() else []
         for fold in range(given.folds):
             if fold < len(found) and "mean" in found[fold][COLUMNS[0]]:
                 continue
             found[fold : fold + 1] = [measure(name, given.data, given.out, fold)]
-            file.parent.mkdir(exist_ok=True)
-            file.write_text(json.dumps(found, indent=1), encoding="utf-8")
+            pages.write_figures(file, found)
             write_page()
 
 
 def write_page() -> None:
     """Write the page from all stored figures."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
-    rows = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
+    rows = {name: pages.read_figures(file) for name, file in files.items() if file.exists()}
     tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
     for name, found in rows.items():
         modes = [fold["modes"] for fold in found]

@@ -169,7 +169,8 @@ def ceiling(model: ShapeModel, codes: Codes) -> float | None:
     facts = model.manifest
     if model.decoder.modes is None or facts.exponential_steps is None:
         return None
-    space = ShellSpace(model.reference, Material(facts.mu, facts.lambda_, facts.eta))
+    material = Material(facts.mu, facts.lambda_, facts.eta)
+    space = ShellSpace(model.reference, material, first_step=facts.exponential_first_step)
     velocities = [np.tensordot(code.astype(np.float64), model.decoder.modes, 1) for code in codes]
     start, steps = model.reference.vertices, facts.exponential_steps
     return statistics.median(seconds(partial(exponential, space, start, v, steps)) for v in velocities)

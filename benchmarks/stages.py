@@ -172,7 +172,7 @@ def serving(folder: Path) -> tuple[float, float]:
 
 def write_page() -> None:
     """Write the page from the stored figures."""
-    found = json.loads(FIGURES.read_text(encoding="utf-8"))
+    found = pages.read_figures(FIGURES)
     seconds, memory = [], []
     for row in found["rows"]:
         title = Size(**row["size"]).beside(BASE) or "base"
@@ -220,7 +220,7 @@ def main() -> None:
             }
         )
     if rows:
-        FIGURES.write_text(json.dumps({"day": f"{datetime.now(UTC):%Y-%m-%d}", "rows": rows}, indent=1), "utf-8")
+        pages.write_figures(FIGURES, {"day": f"{datetime.now(UTC):%Y-%m-%d}", "rows": rows})
     write_page()
 
 

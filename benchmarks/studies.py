@@ -272,7 +272,8 @@ def main() -> None:
         )
     if studies == Studies():
         parser.error(f"{LISTED.name} lists no such studies of {given.run.resolve().name}")
-    run = Run(given.run, *load(given.run / "config.toml"), given.models)
+    config = given.run / "config.toml"
+    run = Run(given.run, *load(config, stored=config), given.models)
     if not run.directory.evaluation.exists():
         parser.error(f"{given.run} has no evaluation.json: finish the run first")
     add(run, studies)

@@ -77,7 +77,7 @@ class CollectionErrors:
 
 def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
     """Read the figures of one collection: all its folds, and what other runs say about simple models."""
-    folds = json.loads((runs / "collections" / f"{name}.json").read_text(encoding="utf-8"))
+    folds = pages.read_figures(runs / "collections" / f"{name}.json")
     unseen = [fold["unseen"] for fold in folds]
     shapes = [fold["shapes"] for fold in unseen]
 
@@ -94,7 +94,7 @@ def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
     simple = set.intersection(*(set(fold) for fold in unseen)) - {*OURS, COMPONENTS}
     found.ratios = {rival: mean([fold[rival] for fold in unseen]) / found.components for rival in simple}
     if (file := runs / "folds" / f"{name}-mirrored.json").exists():
-        mirrored = json.loads(file.read_text(encoding="utf-8"))
+        mirrored = pages.read_figures(file)
         found.ratios[WITH_IMAGES] = mirrored["mirrored_components"][-1]["mean"] / mirrored["components"][-1]["mean"]
     found.ratios = {rival: ratio for rival, ratio in found.ratios.items() if ratio < 1}
     return found
@@ -115,7 +115,7 @@ def times(runs: Path = RUNS) -> list[TrainingTime]:
     """Return the times of whole runs, from the shortest to the longest."""
     found = []
     for name in TIMED:
-        run = json.loads((runs / "results" / f"{name}.json").read_text(encoding="utf-8"))
+        run = pages.read_figures(runs / "results" / f"{name}.json")
         counts, ingest = run["drawn"], run["ingest"]
         computed = counts["joint"] + counts["of factors"]
         title = TITLES[name.partition("-")[0]]
@@ -188,7 +188,7 @@ def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
         fewer={"whole": by_name["samba"], "half": collection("samba" + HALF, runs)},
         images=WITH_IMAGES,
         times=times(runs),
-        growth=json.loads((runs / "growth.json").read_text(encoding="utf-8"))["rows"],
+        growth=pages.read_figures(runs / "growth.json")["rows"],
     )
 
 

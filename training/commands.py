@@ -85,7 +85,8 @@ def _open(folder: Path, models: Path) -> Run:
             "written, such as runs/NAME"
         )
     refuse_old(directory)
-    return Run(folder, *load(directory.config.path), models)
+    stored = directory.config.path
+    return Run(folder, *load(stored, stored=stored), models)
 
 
 def _command(work: Callable[..., None]) -> Callable[..., int]:
@@ -142,8 +143,9 @@ def run(
     models: Path,
 ) -> None:
     """Train the model of a configuration."""
-    settings, source = load(config, data)
-    begun = Run(_folder(config, out), settings, source, models, scheduler, accept)
+    folder = _folder(config, out)
+    settings, source = load(config, data, RunDirectory(folder).config.path)
+    begun = Run(folder, settings, source, models, scheduler, accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
     _execute(begun, until, keep_going=keep_going, command=again)
     if until not in (None, "export"):

@@ -144,6 +144,8 @@ class Manifest(_Strict):
     eta_reconstruction: PositiveFloat
     #: K, the number of time steps of the exponentials, if the bundle has modes.
     exponential_steps: PositiveInt | None = None
+    #: First step of the exponentials. Version 0.2 wrote none, and took the paper's.
+    exponential_first_step: Literal["centred", "paper"] = "paper"
     scale: PositiveFloat
     combiner: Network
     start: Network | None

@@ -34,6 +34,7 @@ from shapespace.files.atomic import replaced_folder, synced_file
 from shapespace.files.limits import clipped
 from shapespace.files.npz import npz_bytes
 from shapespace.shell.energy import Material
+from shapespace.shell.space import FirstStep
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class Facts:
     figures: Mapping[str, Any]
     origin: Origin
     exponential_steps: int | None = None
+    exponential_first_step: FirstStep = "paper"
     draft_error: Mapping[str, float] | None = None
 
 
@@ -180,7 +182,8 @@ def entry(content: bytes) -> FileEntry:
 
 def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> Manifest:
     reference = geometry.reference
-    same = ("name", "version", "licence", "title", "description", "eta_reconstruction", "exponential_steps", "scale")
+    same = ["name", "version", "licence", "title", "description", "eta_reconstruction", "scale"]
+    same += ["exponential_steps", "exponential_first_step"]
     return Manifest.model_validate({
         "schema_version": SCHEMA_VERSION,
         **{name: getattr(facts, name) for name in (*same, "draft_error", "origin")},

@@ -45,7 +45,7 @@ def require_tangent_space(model: Decoder) -> tuple[FloatArray, int]:
 def exact_shape(
     model: Decoder, code: Codes, answer: NDArray[np.float32], mesh: MeshChoice, deadline: Deadline | None = None
 ) -> ExactShape:
-    """Compute the exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, with the material and K of the model's manifest.
+    """Compute the exponential ``exp_z̄(Σ_j code_j u_j)`` in K steps, as the model's manifest says.
 
     The networks give the shape ``answer`` (V, 3) for the code (m,), on the mesh of choice. After the deadline the
     status is Status.DEADLINE.
@@ -56,7 +56,8 @@ def exact_shape(
         space = model.spaces.get_nowait()
     except queue.Empty:
         manifest = model.manifest
-        space = ShellSpace(model.reference, Material(manifest.mu, manifest.lambda_, manifest.eta))
+        material = Material(manifest.mu, manifest.lambda_, manifest.eta)
+        space = ShellSpace(model.reference, material, first_step=manifest.exponential_first_step)
     try:
         path = exponential(space, model.reference.vertices, velocity, steps, deadline=deadline)
     finally:

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import NormalMatrix
-from shapespace.mesh.rigid_motion import without_rigid_motion
+from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.shell.space import DiscretePath, ShellPoint
 
 
@@ -24,6 +24,9 @@ class ExponentialDerivative:
     ∂₁∂₁W[z_k, z_{k+1}]) J_k + Σ_i p_i D²z_i(X_k)``. Here p is the covector in parentheses in F_k. It vanishes on
     tangent vectors only, so the curvature of ``X ↦ z(X)`` contributes. One LU factorisation per step serves any number
     of directions, and the transposed recursion backwards in time.
+
+    With a centred first step, ``X_1 = (X_0 + v/K + X) / 2``, where X follows ``X_{−1} = X_0 − v/K`` and X_0. Its change
+    is δ = ``D⁻¹ D_{−1}ᵀ δv/K``, with D for the step from X_0 to X. Then δ is projected, because X is aligned to X_0.
 
     All fields are without infinitesimal rigid motions of their shapes, which change no length and no angle.
 
@@ -48,17 +51,15 @@ class ExponentialDerivative:
             ahead = _coupling(current, following)
             self._ahead.append(ahead)
             self._here.append(_stiffness(previous, current, following))
-            # Regularise on rigid motions. The matrix is close to −A, which is definite, so no pivoting is needed, and
-            # the ordering is for symmetric patterns.
-            shift = NormalMatrix.REGULARISATION * ahead.diagonal().mean() * sparse.eye_array(ahead.shape[0])
-            regular = sparse.csc_array(ahead + shift)
-            mode = {"SymmetricMode": True}
-            self._factors.append(splu(regular, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=mode))
+            self._factors.append(_factorised(ahead))
+        self._first = None if path.before is None else _CentredStep(path, path.before)
 
     def push_forward(self, velocities: FloatArray) -> FloatArray:
         """Compute ``D exp(v) δv`` (n, V, 3), the changes of the last shape for changes δv of the velocity (n, V, 3)."""
         before = np.zeros_like(velocities)
         now = without_rigid_motion(velocities, self._shapes[0]) / self._steps
+        if self._first:
+            now = self._first.push_forward(now)
         for k in range(1, self._steps):
             forces = _apply(self._here[k - 1], now)
             if k > 1:
@@ -73,20 +74,79 @@ class ExponentialDerivative:
             multiplier = self._solve(k, following, transposed=True)
             following = current - _apply(self._here[k - 1], multiplier)
             current = -_apply(self._ahead[k - 2], multiplier) if k > 1 else current
+        if self._first:
+            following = self._first.pull_back(following)
         return without_rigid_motion(following, self._shapes[0]) / self._steps
 
     def _solve(self, k: int, right: FloatArray, *, transposed: bool = False) -> FloatArray:
         """Solve with D_k for forces on X_k, or with D_kᵀ for forces on X_{k+1}, up to rigid motions."""
-        of, at = (k + 1, k) if transposed else (k, k + 1)
-        matrix = self._ahead[k - 1].T if transposed else self._ahead[k - 1]
-        kind: Literal["N", "T"] = "T" if transposed else "N"
-        found, left = np.zeros_like(right), right
-        for _ in range(2):  # twice, because the factorised matrix is regularised
-            balanced = without_rigid_motion(left, self._shapes[of]).reshape(len(right), -1)
-            step: FloatArray = self._factors[k - 1].solve(balanced.T, kind)  # type: ignore[call-overload] # stubs lack it
-            found = found + without_rigid_motion(step.T.reshape(right.shape), self._shapes[at])
-            left = right - _apply(matrix, found)
-        return found
+        shapes = self._shapes[k], self._shapes[k + 1]
+        return _solve(self._ahead[k - 1], self._factors[k - 1], shapes, right, transposed=transposed)
+
+
+class _CentredStep:
+    """The derivative of X_1 by the stride v/K, for a centred first step."""
+
+    def __init__(self, path: DiscretePath, before: FloatArray) -> None:
+        self._start = path.vertices[0]
+        self._following = 2 * path.vertices[1] - 2 * self._start + before
+        start = path.space.point(self._start)
+        self._behind = _coupling(path.space.point(before), start)
+        self._ahead = _coupling(start, path.space.point(self._following))
+        self._factor = _factorised(self._ahead)
+        self._here, self._there = rigid_motions(self._start), rigid_motions(self._following)
+
+    def push_forward(self, strides: FloatArray) -> FloatArray:
+        """Compute the changes of X_1 for changes of the stride (n, V, 3) without rigid motion."""
+        forces = _apply(self._behind.T, strides)
+        following = self._solve(forces)
+        return (strides + _projected(following, self._there, self._here)) / 2
+
+    def pull_back(self, gradients: FloatArray) -> FloatArray:
+        """Convert gradients (n, V, 3) by X_1 to gradients by the stride."""
+        following = _projected(gradients, self._here, self._there)
+        return (gradients + _apply(self._behind, self._solve(following, transposed=True))) / 2
+
+    def _solve(self, right: FloatArray, *, transposed: bool = False) -> FloatArray:
+        return _solve(self._ahead, self._factor, (self._start, self._following), right, transposed=transposed)
+
+
+def _projected(fields: FloatArray, along: FloatArray, onto: FloatArray) -> FloatArray:
+    """Remove from fields (n, V, 3) the motions (6, 3V) ``along`` that make them orthogonal to the motions ``onto``."""
+    flat = fields.reshape(len(fields), -1)
+    shares = np.linalg.solve(onto @ along.T, onto @ flat.T)
+    return (flat - shares.T @ along).reshape(fields.shape)
+
+
+def _factorised(matrix: sparse.csc_array) -> SuperLU:
+    """Factorise ``D_k``, regularised on rigid motions.
+
+    The matrix is close to −A, which is definite. So no pivoting is needed, and the ordering is for symmetric patterns.
+    """
+    shift = NormalMatrix.REGULARISATION * matrix.diagonal().mean() * sparse.eye_array(matrix.shape[0])
+    mode = {"SymmetricMode": True}
+    regular = sparse.csc_array(matrix + shift)
+    return splu(regular, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=mode)
+
+
+def _solve(
+    matrix: sparse.csc_array,
+    factor: SuperLU,
+    shapes: tuple[FloatArray, FloatArray],
+    right: FloatArray,
+    *,
+    transposed: bool = False,
+) -> FloatArray:
+    """Solve with a factorised D for forces on the first of two shapes, or with Dᵀ for forces on the second."""
+    of, at = shapes[::-1] if transposed else shapes
+    kind: Literal["N", "T"] = "T" if transposed else "N"
+    found, left = np.zeros_like(right), right
+    for _ in range(2):  # twice, because the factorised matrix is regularised
+        balanced = without_rigid_motion(left, of).reshape(len(right), -1)
+        step: FloatArray = factor.solve(balanced.T, kind)  # type: ignore[call-overload] # stubs lack it
+        found = found + without_rigid_motion(step.T.reshape(right.shape), at)
+        left = right - _apply(matrix.T if transposed else matrix, found)
+    return found
 
 
 def _apply(matrix: sparse.csc_array | sparse.csr_array, fields: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import unwrap
 from shapespace.mesh.rigid_motion import align
+from shapespace.shell.exponential import velocity_of
 from shapespace.shell.initial_paths import (
     InitialPath,
     bisected,
@@ -105,9 +106,9 @@ class Logarithm:
     """The initial velocity of a geodesic.
 
     Attributes:
-        velocity: (V, 3) vertex field ``K (X_1 − X_0)``, without rigid motion: an argument for ``exponential``. Zero if
-            no geodesic was found.
-        nric: (2E,) ``K (z_1 − z_0)``, the velocity of lengths and angles, tangent up to O(1/K).
+        velocity: (V, 3) vertex field without rigid motion: an argument for ``exponential``. With the paper's first step
+            it is ``K (X_1 − X_0)``. Zero if no geodesic was found.
+        nric: (2E,) ``K (z_1 − z_0)``, the velocity of lengths and angles over the first step, tangent up to O(1/K).
         path: the geodesic, with status and reason.
     """
 
@@ -127,8 +128,11 @@ def logarithm(
     if not path.converged:
         nothing = np.zeros_like(path.vertices[0])
         return Logarithm(nothing, np.zeros(2 * space.connectivity.edge_count), path)
-    velocity = steps * (path.vertices[1] - path.vertices[0])
-    return Logarithm(velocity, steps * (path.nric[1] - path.nric[0]), path)
+    velocity, change = velocity_of(path, tolerance), steps * (path.nric[1] - path.nric[0])
+    if velocity is None:
+        reason = "no velocity leads to the first shape; more steps may help"
+        return Logarithm(np.zeros_like(path.vertices[0]), change, replace(path, status=Status.STALLED, reason=reason))
+    return Logarithm(velocity, change, path)
 
 
 def towards(space: ShellSpace, path: DiscretePath, end: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +35,8 @@ from shapespace.solve.preconditioner import Preconditioner
 
 #: Tolerance of equations F = 0, for ``sqrt(Fᵀ A⁻¹ F)``: the length in the metric of a further Newton step.
 TOLERANCE = 1e-9
+#: The first step of an exponential: straight on by d/K, as in the paper, or centred. See ``exponential``.
+FirstStep = Literal["centred", "paper"]
 
 
 @dataclass(frozen=True)
@@ -172,13 +175,21 @@ class ShellSpace:
         reference: mesh that determines the connectivity, and the area to which η refers, so that units don't matter.
         material: μ, λ and η.
         backend: Cholesky backend.
+        first_step: first step of exponentials and logarithms.
     """
 
-    def __init__(self, reference: TriangleMesh, material: Material | None = None, backend: Backend = "auto") -> None:
+    def __init__(
+        self,
+        reference: TriangleMesh,
+        material: Material | None = None,
+        backend: Backend = "auto",
+        first_step: FirstStep = "centred",
+    ) -> None:
         self.reference = reference
         self.connectivity = reference.connectivity
         self.material = material or Material()
         self.backend: Backend = backend
+        self.first_step: FirstStep = first_step
         self.energy = ShellEnergy(self.connectivity, self.material, reference.area)
         self.jacobian = NRICJacobian(self.connectivity)
         self.vertex_rotations = VertexRotations(self.connectivity)
@@ -186,7 +197,7 @@ class ShellSpace:
         self._factorise: list[Factorise] = []
 
     def __reduce__(self) -> tuple:
-        return type(self), (self.reference, self.material, self.backend)
+        return type(self), (self.reference, self.material, self.backend, self.first_step)
 
     def factorisations(self, count: int) -> list[Factorise]:
         """Return `count` functions that factorise A at a shape; their factors can be used at the same time."""
@@ -259,10 +270,12 @@ class DiscretePath(Outcome):
     Attributes:
         vertices: (n, V, 3), always finite.
         space: the space of the shapes.
+        before: X_0 − d/K (V, 3), where an exponential took a centred first step.
     """
 
     vertices: FloatArray
     space: ShellSpace = field(repr=False)
+    before: FloatArray | None = field(default=None, repr=False)
 
     @cached_property
     def nric(self) -> FloatArray:

@@ -105,8 +105,8 @@ TESTS = {
         {"EXAMPLES": "100"},
     ),
     "mutants": LongTest(
-        "make COUNT small mistakes in the library and see which of them its tests miss",
-        ("shapespace",),
+        "make COUNT small mistakes in library and training and see which of them their tests miss",
+        ("shapespace", "training"),
         ("python -m pip install cosmic-ray>=8.7 pytest-cov>=7", "python -m tests.mutants {COUNT}"),
         {"COUNT": "160"},
     ),

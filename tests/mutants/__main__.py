@@ -1,4 +1,4 @@
-"""Mutation testing of the library: ``python -m tests.mutants [COUNT] [--seed N] [--only T]``.
+"""Mutation testing of library and training: ``python -m tests.mutants [COUNT] [--seed N] [--only T]``.
 
 Cosmic Ray makes mutants, each a copy of the code with one small change. Of all possible mutants a random
 sample is tested, with a share for each module by its number of lines, and no two at one position. A mutant
@@ -28,6 +28,10 @@ from coverage import CoverageData
 
 ROOT = Path(__file__).parents[2]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider"]
+#: What is changed, and tested by the tests of the same name.
+PACKAGES = ("shapespace", "training")
+#: What the tests need beside them.
+COPIED = (*PACKAGES, "service", "models", "tests", "benchmarks", "runs", "examples", "docs", "scripts")
 #: Time limit for a mutant, as a multiple of the time of all tests on the unchanged code.
 PATIENCE = 1.5
 
@@ -82,11 +86,11 @@ class Tests:
     def __init__(self) -> None:
         data = CoverageData("build/coverage")
         data.read()
-        self._contexts = {Path(file): data.contexts_by_lineno(file) for file in data.measured_files()}
+        self._contexts = {Path(file).resolve(): data.contexts_by_lineno(file) for file in data.measured_files()}
 
     def of(self, mutation: MutationSpec) -> list[str]:
         module = mutation.module_path
-        by_line = self._contexts.get(module.absolute(), {})
+        by_line = self._contexts.get(module.resolve(), {})
         lines = statements(module).get(mutation.start_pos[0], ())
         found = functions(by_line.get(line, []) for line in lines)
         # A line that runs on import may be detected by every test of the module.
@@ -112,7 +116,9 @@ def statements(module: Path) -> dict[int, range]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="Mutation testing of the library.")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.mutants", description="Mutation testing of library and training."
+    )
     parser.add_argument("count", nargs="?", type=int, default=160, help="how many mutants")
     parser.add_argument("--seed", type=int, default=9)
     parser.add_argument("--only", default="", metavar="TEXT", help="of the sample, those with this in their names")
@@ -122,17 +128,22 @@ def main() -> int:
     outcomes: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as copy:
         unneeded = shutil.ignore_patterns("node_modules", "__pycache__")
-        for package in ("shapespace", "service", "training", "models", "tests"):
+        for package in COPIED:
             shutil.copytree(ROOT / package, Path(copy) / package, ignore=unneeded, symlinks=True)
         shutil.copy(ROOT / "pyproject.toml", copy)
         (Path(copy) / "build").mkdir()
         os.chdir(copy)
         os.environ["PYTHONPATH"] = copy
         start = time.monotonic()
-        measured = ["--cov=shapespace", "--cov-context=test", "--cov-report="]
-        subprocess.run([*PYTEST, *measured, "tests/shapespace"], check=True)
+        measured = ["--cov=shapespace", "--cov-context=test", "--cov-report="]  # a link there leads to training
+        subprocess.run([*PYTEST, *measured, *(f"tests/{package}" for package in PACKAGES)], check=True)
         timeout = PATIENCE * (time.monotonic() - start)
-        modules = [path for path in Path("shapespace").glob("[a-z]*/[a-z]*.py") if not path.parent.is_symlink()]
+        modules = [
+            path
+            for package in PACKAGES
+            for path in Path(package).glob("[a-z]*/**/[a-z]*.py")
+            if not any(parent.is_symlink() for parent in path.parents)
+        ]
         total, chosen = sample(sorted(modules), options.count, options.seed)
         print(f"{len(chosen)} of {total} mutants, seed {options.seed}, at most {timeout:.0f} s each", flush=True)
         tests = Tests()

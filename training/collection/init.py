@@ -14,7 +14,13 @@ from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import ConfigError
 from shapespace.training.runs.network_settings import CombinerSettings, LatentNetworkSettings
-from shapespace.training.runs.settings import CollectionSettings, MaterialSettings, ModeSettings, SampleSettings
+from shapespace.training.runs.settings import (
+    CollectionSettings,
+    ExponentialSettings,
+    MaterialSettings,
+    ModeSettings,
+    SampleSettings,
+)
 
 TEMPLATE = """\
 # {title}: {shapes} shapes with {vertices} vertices and {faces} faces.
@@ -29,6 +35,9 @@ data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; rel
 
 [material]
 # eta = {material.eta:g}    # resistance to bending against stretching; with large values, triangles may collapse
+
+[exponential]
+# first_step = "{exponential.first_step}"    # how a geodesic begins; "paper" needs far more time steps to be as exact
 
 [modes]
 # count = "{mode.count}"    # how many numbers describe a shape, at most {most}; "auto" stops when more help little
@@ -94,6 +103,7 @@ def configuration(
         if file
         else "",
         material=MaterialSettings(),
+        exponential=ExponentialSettings(),
         most=count - 1,
         mode=ModeSettings(),
         sample=SampleSettings(),

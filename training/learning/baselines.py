@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,9 +36,16 @@ SEARCH = KernelSearch()
 FEWEST_NODES = 3
 
 
-#: Function of a name, codes (n, m) and, if it isn't the run's, a collection. It computes exact NRIC (n, 2E), NaN for a
-#: code without a shape, and saves them under the name.
-ExactShapes = Callable[..., NDArray[np.float32]]
+class Exact(NamedTuple):
+    """Exact lengths and angles (n, 2E) and vertices (n, V, 3), NaN for a code without a shape."""
+
+    nric: NDArray[np.float32]
+    vertices: NDArray[np.float32]
+
+
+#: Function of a name, codes (n, m) and, if it isn't the run's, a collection. It computes exact shapes and saves them
+#: under the name.
+ExactShapes = Callable[..., Exact]
 
 
 class LatentKernel(nn.Module):
@@ -105,11 +113,11 @@ class MultilinearGrid:
     """Multilinear interpolation of exact shapes on a regular grid of one factor (Sassen et al. 2020).
 
     There are ``nodes`` along each latent of the factor. The end of a period equals its beginning and does not count.
-    ``shapes`` computes exact NRIC (n, 2E) of codes (n, m).
+    ``shapes`` computes exact shapes of codes (n, m).
     """
 
     def __init__(
-        self, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], NDArray]
+        self, coordinates: Coordinates, factor: list[int], nodes: int, shapes: Callable[[FloatArray], Exact]
     ) -> None:
         own = coordinates[factor]
         ends = np.isfinite(own.period).astype(int)
@@ -117,7 +125,7 @@ class MultilinearGrid:
         latents = np.zeros((nodes ** len(factor), len(coordinates)))
         at_nodes = np.meshgrid(*(axis[:nodes] for axis in axes), indexing="ij")
         latents[:, factor] = np.stack(at_nodes, axis=-1).reshape(-1, len(factor))
-        values = shapes(latents).reshape(*[nodes] * len(factor), -1)
+        values = shapes(latents).nric.reshape(*[nodes] * len(factor), -1)
         closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
         # Rounding may move a code slightly outside of the grid.
         self.interpolate = RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None)

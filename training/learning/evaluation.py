@@ -133,13 +133,18 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
         if np.isfinite(interpolated).all():
             r2["grid"] = test.r2_of(interpolated)
             sizes["grid"] = sum(grid.size for grid in grids)
+    fresh = on_fresh_codes(models, learner, min(settings.fresh, len(test.rows)), exact)
+    limit = against_limit(learner, fresh["seed"], fresh["codes"], exact) if fresh else None
+    if limit:
+        r2["limit"] = limit["composite"].pop("r2")
     first, eta = slice(settings.reconstructions), config.export.eta_reconstruction
     vertices, errors, vertex_error = reconstruct(reference, eta, test.predicted(composite)[first], test.vertices[first])
     figures = {
         "eta": settings.eta,
         "test_samples": len(test.rows),
         "r2": r2,
-        "fresh": on_fresh_codes(models, learner, min(settings.fresh, len(test.rows)), exact),
+        "fresh": fresh,
+        "limit": limit,
         "affine_samples": len(found),
         "r2_factors": {
             name: r_squared(learned[found, j], shapes[:, j], test.norm) for j, name in enumerate(collection.factors)
@@ -155,8 +160,8 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
 
 
-#: Share of the fresh codes whose exponentials are also computed with twice as many steps.
-FINER = 0.2
+#: Share of the fresh codes whose exponentials are also computed near the limit of many steps.
+NEAR_LIMIT = 0.2
 
 
 def on_fresh_codes(
@@ -168,8 +173,7 @@ def on_fresh_codes(
 
     Returns:
         ``seed``, the first 32 bits of the digest; the SHA-256 of the ``count`` codes as doubles; the number that
-        ``failed``, and R² on the others. ``steps``, where exponentials are made by steps: R² of the exponentials
-        against exponentials of twice as many steps. None if fewer than two codes have a shape.
+        ``failed``, and R² on the others. None if fewer than two codes have a shape.
     """
     collection, coordinates = learner.collection, learner.collection.coordinates
     digest = hashlib.sha256()
@@ -178,25 +182,60 @@ def on_fresh_codes(
             digest.update(tensor.contiguous().numpy().tobytes())
     seed = int(digest.hexdigest()[:8], 16)
     codes = coordinates.uniform(count, np.random.default_rng(seed))
-    z = exact("fresh", codes) if count else np.empty((0, 0))
+    z = exact("fresh", codes).nric if count else np.empty((0, 0))
     found = np.flatnonzero(np.isfinite(z).all(axis=1))
     if len(found) < 2:
         return None
     norm = WeightedNorm.of(collection.reference, learner.config.evaluation.eta)
     latents = torch.as_tensor(codes[found], dtype=torch.float32)
-    result = {
+    return {
         "seed": seed,
         "sha256": hashlib.sha256(codes.tobytes()).hexdigest(),
         "codes": count,
         "failed": count - len(found),
         "r2": {name: r_squared(predict(model, latents).numpy(), z[found], norm) for name, model in models.items()},
     }
-    if collection.finer:
-        some = found[: max(2, round(FINER * count))]
-        finer = exact("fresh, finer", codes[some], collection.finer)
-        both = np.flatnonzero(np.isfinite(finer).all(axis=1))
-        result["steps"] = r_squared(z[some][both], finer[both], norm) if len(both) > 1 else None
-    return result
+
+
+def against_limit(learner: Learner, seed: int, count: int, exact: ExactShapes) -> dict[str, Any] | None:
+    """Compare the composite and the exponentials of K steps with the limit of many steps, on a fifth of fresh codes.
+
+    Arguments are the seed and number of the fresh codes. Vertex distances are fractions of the diagonal of the
+    reference's bounding box, after rigid alignment.
+
+    Returns:
+        ``steps`` of the exponentials that stand for the limit; the number of ``codes`` with a shape; ``r2`` and
+        ``vertices``, the ``mean`` and ``max`` distance, for ``composite`` and ``exponentials``. None where shapes have
+        no time steps, or fewer than two codes have both shapes.
+    """
+    collection, config = learner.collection, learner.config
+    if collection.limit is None:
+        return None
+    codes = collection.coordinates.uniform(count, np.random.default_rng(seed))
+    some = codes[: max(2, round(NEAR_LIMIT * count))]
+    shot, wanted = exact("fresh", codes), exact("fresh, limit", some, collection.limit)
+    there = np.isfinite(shot.nric[: len(some)]).all(axis=1) & np.isfinite(wanted.nric).all(axis=1)
+    rows = np.flatnonzero(there)
+    if len(rows) < 2:
+        return None
+    norm = WeightedNorm.of(collection.reference, config.evaluation.eta)
+    answers = predict(learner.main(), torch.as_tensor(some[rows], dtype=torch.float32)).numpy()
+    reference = collection.reference
+    ends, limit = (found.vertices[rows].astype(np.float64) for found in (shot, wanted))
+    away = np.linalg.norm(align(ends, limit) - limit, axis=2) / reference.diagonal
+    missed = reconstruct(reference, config.export.eta_reconstruction, answers, limit)[2]
+    return {
+        "steps": collection.limit.steps,
+        "codes": len(rows),
+        "composite": {
+            "r2": r_squared(answers, wanted.nric[rows], norm),
+            "vertices": {name: missed[name] for name in ("mean", "max")},
+        },
+        "exponentials": {
+            "r2": r_squared(shot.nric[rows], wanted.nric[rows], norm),
+            "vertices": {"mean": float(away.mean()), "max": float(away.max())},
+        },
+    }
 
 
 def exact_factors(learner: Learner, rows: IntArray, exact: ExactShapes) -> tuple[NDArray[np.float32], IntArray]:
@@ -221,7 +260,7 @@ def _exact_factor(learner: Learner, rows: IntArray, j: int, exact: ExactShapes) 
     result[known] = samples.nric[np.searchsorted(samples.index, codes[known])]
     beyond = codes >= learner.config.samples.own(len(learner.collection.factors))[j]
     if beyond.any():
-        result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[rows[beyond]], index))
+        result[beyond] = exact(f"factor-{j}", alone(learner.joint.latents[rows[beyond]], index)).nric
     return result
 
 

@@ -137,6 +137,7 @@ def export(
         material=Material(material.mu, material.lambda_, material.eta),
         eta_reconstruction=settings.eta_reconstruction,
         exponential_steps=collection.steps,
+        exponential_first_step=collection.first_step,
         scale=collection.scale,
         tolerance=Tolerance(required=settings.tolerance, measured=measured),
         figures=figures,

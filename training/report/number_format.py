@@ -4,6 +4,9 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+#: Most decimals of a number that is close to a whole.
+MOST_DIGITS = 15
+
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values in nested dictionaries and lists, each with its path."""
@@ -22,8 +25,15 @@ def figure(value: Any) -> str:
 
 
 def r2(value: float | None) -> str:
-    """Format a coefficient of determination with four decimals."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.4f}"
+    """Format a coefficient of determination with four decimals, or with as many as keep it from rounding up to 1."""
+    return "–" if value is None or not math.isfinite(value) else short_of(value, 4)
+
+
+def short_of(value: float, digits: int, whole: float = 1.0) -> str:
+    """Format a number with some decimals, or with as many as keep it from rounding up to the whole."""
+    while value < whole and digits < MOST_DIGITS and float(f"{value:.{digits}f}") >= whole:
+        digits += 1
+    return f"{value:.{digits}f}"
 
 
 def percent(value: float, digits: int = 2) -> str:

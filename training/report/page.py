@@ -33,7 +33,17 @@ MODELS = {
 }
 #: Keys of evaluation.json with a section on the page; one table lists all other keys.
 PLACED = {"eta", "test_samples", "r2", "r2_factors", "variants", "vertex_error", "sizes", "times", "fractions"}
-PLACED |= {"compactness", "specificity", "prolongation", "generalisation", "fresh", "correction", "validation"}
+PLACED |= {
+    "compactness",
+    "specificity",
+    "prolongation",
+    "generalisation",
+    "fresh",
+    "limit",
+    "made_by",
+    "correction",
+    "validation",
+}
 #: Descriptions of the kinds of corrections.
 CORRECTIONS = {
     "kernel": "kernel ridge regression",

@@ -15,6 +15,7 @@ from shapespace.training.runs.network_settings import FitSettings, LatentNetwork
 from shapespace.training.runs.settings import (
     CollectionSettings,
     EvaluationSettings,
+    ExponentialSettings,
     ExportSettings,
     FactorSettings,
     MaterialSettings,
@@ -33,6 +34,7 @@ class Config(SettingsTable):
 
     collection: CollectionSettings
     material: MaterialSettings = MaterialSettings()
+    exponential: ExponentialSettings = ExponentialSettings()
     modes: ModeSettings = ModeSettings()
     factors: FactorSettings = FactorSettings()
     samples: SampleSettings = SampleSettings()
@@ -88,14 +90,36 @@ def parse(text: str, source: str) -> Config:
         raise ConfigError("\n  ".join(lines)) from error
 
 
-def load(path: Path, data: Path | None = None) -> tuple[Config, str]:
+def load(path: Path, data: Path | None = None, stored: Path | None = None) -> tuple[Config, str]:
     """Read a configuration file.
 
-    ``data`` replaces ``collection.data``.
+    ``data`` replaces ``collection.data``. ``stored`` is the configuration in the run directory, which need not exist
+    and may be the same file. A run of version 0.2 has no ``exponential.first_step`` there, and keeps the paper's.
 
-    Returns the configuration, and a text with the same meaning in any folder: ``collection.data`` is absolute, all else
-    as it stands in the file. Raises ConfigError, which names the file and every faulty setting.
+    Returns the configuration, and a text with the same meaning in any folder and in later versions:
+    ``collection.data`` is absolute, ``exponential.first_step`` is given, all else is as it stands in the file. Raises
+    ConfigError, which names the file and every faulty setting.
     """
+    config, text = _load(path, data)
+    if "first_step" in config.exponential.model_fields_set:
+        return config, text
+    formula = config.collection.generator == "freaky-torus"  # without exponentials
+    if formula or (stored is not None and _is_of_0_2(stored)):
+        return config.model_copy(update={"exponential": ExponentialSettings(first_step="paper")}), text
+    document: Any = tomlkit.parse(text)
+    document.setdefault("exponential", tomlkit.table())["first_step"] = config.exponential.first_step
+    return config, tomlkit.dumps(document)
+
+
+def _is_of_0_2(stored: Path) -> bool:
+    """Return whether a run directory has a configuration, without a first step."""
+    try:
+        return "first_step" not in tomllib.loads(read_plain(stored).decode()).get("exponential", {})
+    except (OSError, ValueError):
+        return False
+
+
+def _load(path: Path, data: Path | None = None) -> tuple[Config, str]:
     try:
         text = read_plain(path).decode().replace("\r\n", "\n")
     except UnicodeDecodeError as error:

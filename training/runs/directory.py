@@ -140,7 +140,8 @@ class RunDirectory:
     """The sparse modes, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``, ``upper`` and
     ``localisation``; ``pga_nric``, ``pga_vertices`` and ``pga_localisation`` are for the principal modes."""
     decomposition = RunFile(JsonFile, "modes.json")
-    """Facts about the modes: ``modes``, ``explained``, ``history``, and ``steps`` and ``via`` of each logarithm."""
+    """Facts about the modes: ``modes``, ``explained``, ``history``, ``exponential_steps`` K, and ``steps`` and ``via``
+    of each logarithm."""
     modes = RunFile(NpzFile, "modes.npz")
     """The arrays of `modes_by_strength`, in the order of the factors once there are any. ``rank (m)`` is the position
     of each mode in `modes_by_strength`."""
@@ -219,6 +220,10 @@ class RunDirectory:
     def log_steps(self) -> int:
         """Read the time steps K of the logarithms, which were chosen with the mean."""
         return int(self.mean.read()["steps"])
+
+    def steps(self) -> int:
+        """Read the time steps K of exponentials: chosen with the modes, or by version 0.2 with the mean."""
+        return int(self.decomposition.read().get("exponential_steps", self.log_steps()))
 
     def training_codes(self) -> FloatArray:
         """Read the codes (n, m) of all training shapes, mirror images last."""

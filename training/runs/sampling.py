@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.space import FirstStep
 from shapespace.training.runs.atomic_files import NpzFile, reading
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.progress import bar
@@ -79,7 +80,8 @@ class Collection(Protocol):
             and the reference to itself. The combiner also learns from the images of the training samples.
         places: places of features that codes move over the surface; None where no feature moves.
         steps: K of the exponentials; None where shapes are not exponentials.
-        finer: the same collection with twice as many steps; None where that would not be more exact.
+        first_step: first step of the exponentials.
+        limit: the same collection near the limit of many steps; None where that would not be more exact.
         differentiated: the same collection, with derivatives of its shapes; None where these are not known.
     """
 
@@ -102,7 +104,9 @@ class Collection(Protocol):
     @property
     def steps(self) -> int | None: ...  # noqa: D102
     @property
-    def finer(self) -> Collection | None: ...  # noqa: D102
+    def first_step(self) -> FirstStep: ...  # noqa: D102
+    @property
+    def limit(self) -> Collection | None: ...  # noqa: D102
     @property
     def differentiated(self) -> Collection | None: ...  # noqa: D102
 

@@ -6,6 +6,8 @@ from functools import lru_cache, partial
 import numpy as np
 
 from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import WeightedNorm
+from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
@@ -24,6 +26,12 @@ START_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 MARGIN = 0.05
 #: Least width of the negative or positive side of the bounds, as a share of the width of the other side.
 SMALLEST_SIDE = 0.1
+#: Steps of an exponential that stands for the limit of K. With a centred first step, 1 − R² is about 3e-7 there.
+LIMIT_STEPS = 64
+#: Candidates for K, and the largest 1 − R² against the limit: a tenth of the error of good networks.
+STEPS, STEPS_ERROR = (8, 12, 16, 24, 32), 1e-5
+#: Random codes on which K is chosen.
+STEPS_CODES = 12
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,31 @@ def box_of(codes: FloatArray) -> tuple[FloatArray, FloatArray]:
     room = MARGIN * (upper - lower)
     lower, upper = lower - room, upper + room
     return np.minimum(lower, -SMALLEST_SIDE * upper), np.maximum(upper, -SMALLEST_SIDE * lower)
+
+
+def enough_steps(space: ShellSpace, mean: FloatArray, modes: FloatArray, codes: FloatArray, workers: int = -1) -> int:
+    """Return the smallest K whose exponentials are close enough to the limit, see `STEPS`.
+
+    They are compared at random codes in the bounds of ``codes`` (n, m). Where fewer than two of these have a shape, K
+    is the largest candidate.
+    """
+    drawn = np.random.default_rng(0).uniform(*box_of(codes), (STEPS_CODES, codes.shape[1]))
+    results = run(partial(_by_steps, space, mean, modes), list(drawn), workers=workers)
+    shot = [found for _, found in sorted(progress(results, "time steps", "code", len(drawn))) if found is not None]
+    if len(shot) < 2:
+        return STEPS[-1]
+    ends, norm = np.stack(shot, axis=1), WeightedNorm.of(space.reference.with_vertices(mean), DEFAULT_ETA)
+    limit = ends[-1]
+    spread = norm.square(limit - limit.mean(axis=0)).sum()
+    near = [norm.square(end - limit).sum() <= STEPS_ERROR * spread for end in ends]
+    return next((steps for steps, enough in zip(STEPS, near, strict=False) if enough), STEPS[-1])
+
+
+def _by_steps(space: ShellSpace, mean: FloatArray, modes: FloatArray, code: FloatArray) -> FloatArray | None:
+    """Return lengths and angles (k, 2E) of a code's shapes by number of steps, the limit last; None if one fails."""
+    velocity = np.tensordot(code, modes, axes=1)
+    paths = [exponential(space, mean, velocity, steps) for steps in (*STEPS, LIMIT_STEPS)]
+    return np.stack([path.nric[-1] for path in paths]) if all(path.converged for path in paths) else None
 
 
 def _nearest(

@@ -18,7 +18,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.mesh.triangle_quality import folded_anew
 from shapespace.shell.energy import Material
-from shapespace.shell.space import ShellSpace
+from shapespace.shell.space import FirstStep, ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
@@ -30,9 +30,9 @@ from shapespace.training.space.sparse_modes import find_modes
 
 #: Number of folds. Below twice this number of shapes, each shape is held out by itself.
 FOLDS = 5
-#: Default steps K of logarithms and exponentials of a model.
+#: Default steps K of logarithms and exponentials with the paper's first step.
 STEPS = 16
-#: Most steps K where spaces are compared, to save time.
+#: Default steps K of logarithms with a centred first step, and most steps where spaces are compared.
 LIGHT_STEPS = 8
 #: Number of random shapes for the specificity.
 RANDOM = 200
@@ -142,8 +142,9 @@ def time_steps(
     shapes: FloatArray,
     material: Material,
     original_index: IntArray | None = None,
+    first_step: FirstStep = "centred",
 ) -> int:
-    """Return K of logarithms and exponentials, from the settings or by cross-validation.
+    """Return K of logarithms, from the settings or by cross-validation.
 
     With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``: modes add up in vertices. This may come closer to unseen shapes,
     but shapes fold where limbs bend. K = 1 is chosen if it has at most the error of `LIGHT_STEPS` on held-out shapes,
@@ -155,28 +156,29 @@ def time_steps(
     """
     if settings.log_steps != "auto":
         return settings.log_steps
+    many = LIGHT_STEPS if first_step == "centred" else STEPS
     original_index = np.arange(len(shapes)) if original_index is None else original_index
     count = int(original_index.max()) + 1
     if count < FOLDS:  # too few to choose
-        return STEPS
+        return many
     used = original_index % -(-count // CHOICE_SHAPES) == 0
     try:
-        if _folded(reference, shapes, material) > FOLDED_SHARE:
-            return STEPS
+        if _folded(reference, shapes, material, first_step) > FOLDED_SHARE:
+            return many
         original_index, shapes = np.unique(original_index[used], return_inverse=True)[1], shapes[used]
         asked = CHOICE_MODES if settings.count == "auto" else settings.count
         few = max(1, min(asked, (int(original_index.max()) + 1) // 3))
         straight, bent = (
-            _missed(reference, shapes, original_index, material, few, steps) for steps in (1, LIGHT_STEPS)
+            _missed(reference, shapes, original_index, material, few, steps, first_step) for steps in (1, LIGHT_STEPS)
         )
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes report it
-        return STEPS
-    return 1 if straight <= bent else STEPS
+        return many
+    return 1 if straight <= bent else many
 
 
-def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> float:
+def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material, first_step: FirstStep) -> float:
     """Return the share of random shapes of one step that fold where none of the shapes (n, V, 3) has a crease."""
-    space, mean, fields = _space(reference, shapes, material, 1)
+    space, mean, fields = _space(reference, shapes, material, 1, first_step)
     modes = pga(space, mean, fields, min(FOLDED_MODES, len(shapes) - 1), "vertices").vertices
     lower, upper = box_of(coefficients(space, mean, fields, modes, "vertices")[0])
     codes = np.random.default_rng(0).uniform(lower, upper, (FOLDED_SHAPES, len(modes)))
@@ -186,23 +188,29 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material) -> 
 
 
 def _space(
-    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int
+    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int, first_step: FirstStep
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
     """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3). Raises ModeError
     if the shapes have no mean.
     """
-    found = centred_mean(reference, shapes, material, steps)
+    found = centred_mean(reference, shapes, material, steps, first_step=first_step)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"{len(shapes)} shapes that are not held out have no mean: {found.reason}")
-    space = ShellSpace(reference.with_vertices(found.vertices), material)
+    space = ShellSpace(reference.with_vertices(found.vertices), material, first_step=first_step)
     return space, found.vertices, logarithms(space, found.vertices, shapes, steps).fields
 
 
 def _missed(
-    reference: TriangleMesh, shapes: FloatArray, original_index: IntArray, material: Material, modes: int, steps: int
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    original_index: IntArray,
+    material: Material,
+    modes: int,
+    steps: int,
+    first_step: FirstStep,
 ) -> float:
     """Return the mean distance between the originals among shapes (n, V, 3) and the modes of the other folds."""
-    space, mean, fields = _space(reference, shapes, material, steps)
+    space, mean, fields = _space(reference, shapes, material, steps, first_step)
     count = int(original_index.max()) + 1
     away = []
     for index in folds(count):
@@ -222,6 +230,7 @@ def held_out(
     material: Material,
     steps: int | None = None,
     original: IntArray | None = None,
+    first_step: FirstStep = "centred",
 ) -> HeldOut:
     """Find mean, logarithms and modes without some shapes, and approximate these shapes.
 
@@ -235,8 +244,8 @@ def held_out(
     kept, unseen = shapes[known], shapes[index]
     original_index = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
-        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, original_index))
-    space, mean, fields = _space(reference, kept, material, steps)
+        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, original_index, first_step))
+    space, mean, fields = _space(reference, kept, material, steps, first_step)
     own = original[known] == known
     components = PrincipalComponents.of(kept[own], reference.vertices)
     mirrored = None if own.all() else PrincipalComponents.of(kept, reference.vertices)

@@ -7,14 +7,19 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.mean import Mean, elastic_mean
-from shapespace.shell.space import ShellSpace
+from shapespace.shell.space import FirstStep, ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import waiting
 from shapespace.training.space.logarithms import logarithms
 
 
 def centred_mean(
-    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int, workers: int = -1
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    material: Material,
+    steps: int,
+    workers: int = -1,
+    first_step: FirstStep = "centred",
 ) -> Mean:
     """Compute the elastic mean, moved by the mean of the logarithms there.
 
@@ -29,7 +34,7 @@ def centred_mean(
         found = elastic_mean(ShellSpace(reference, material), shapes)
     if found.status is not Status.CONVERGED:
         return found
-    space = ShellSpace(reference.with_vertices(found.vertices), material)
+    space = ShellSpace(reference.with_vertices(found.vertices), material, first_step=first_step)
     common = logarithms(space, found.vertices, shapes, steps, workers).fields.mean(axis=0)
     path = exponential(space, found.vertices, common, steps)
     return replace(found, vertices=path.vertices[-1]) if path.converged else found

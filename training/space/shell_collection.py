@@ -14,9 +14,10 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
-from shapespace.shell.space import DiscretePath, ShellSpace
+from shapespace.shell.space import DiscretePath, FirstStep, ShellSpace
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import SampledShapes
+from shapespace.training.space.codes import LIMIT_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,7 @@ class ShellCollection:
     scale: float
     codes: FloatArray
     with_derivatives: bool = False
+    first_step: FirstStep = "centred"
     #: Modes move no feature over the surface, and no symmetry is known.
     places = None
     symmetries = ()
@@ -48,7 +50,7 @@ class ShellCollection:
     @cached_property
     def space(self) -> ShellSpace:
         """The Riemannian manifold around the mean."""
-        return ShellSpace(self.reference, self.material)
+        return ShellSpace(self.reference, self.material, first_step=self.first_step)
 
     @property
     def latent_names(self) -> tuple[str, ...]:
@@ -65,9 +67,9 @@ class ShellCollection:
         return Coordinates(self.lower, self.upper, np.full(len(self.modes), np.nan))
 
     @property
-    def finer(self) -> ShellCollection | None:
-        """The same collection with twice as many steps; None for one step, which approximates no geodesic."""
-        return replace(self, steps=2 * self.steps) if self.steps > 1 else None
+    def limit(self) -> ShellCollection | None:
+        """The same collection near the limit of many steps; None for one step, which approximates no geodesic."""
+        return replace(self, steps=LIMIT_STEPS, first_step="centred") if self.steps > 1 else None
 
     @property
     def differentiated(self) -> ShellCollection:

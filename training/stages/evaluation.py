@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.runs.sampling import DONE, Collection, parts, read
 from shapespace.training.space.generalisation import RANDOM, PrincipalComponents, to_nearest
 from shapespace.training.stages.networks import learner_of
@@ -15,28 +16,33 @@ from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWa
 
 def measure_run(run: Run) -> None:
     """Write ``evaluation.json`` and ``gallery.npz``."""
+    from shapespace.training.learning.baselines import Exact
     from shapespace.training.learning.evaluation import evaluate
 
     directory = run.directory
 
-    def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> NDArray[np.float32]:
+    def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> Exact:
         folder = directory.exact / name
         run.draw(folder, latents, f"exact shapes, {name}", shorten=False, collection=collection)
         samples = read(folder)
-        result = np.full((len(latents), samples.nric.shape[1]), np.nan, dtype=np.float32)
-        result[samples.index] = samples.nric
-        return result
+
+        def each(values: NDArray[np.float32]) -> NDArray[np.float32]:
+            result = np.full((len(latents), *values.shape[1:]), np.nan, dtype=np.float32)
+            result[samples.index] = values
+            return result
+
+        return Exact(each(samples.nric), each(samples.vertices))
 
     figures, gallery = evaluate(learner_of(run), exact)
     if directory.ingest.exists():
         figures["prolongation"] = directory.ingest.read().get("prolongation")
     unseen = directory.generalisation.read_if_written()
     if unseen and "failed" not in unseen:
-        figures["generalisation"] = unseen
+        figures["generalisation"] = {name: fact for name, fact in unseen.items() if name != MADE_BY}
     if not run.by_design:
         figures |= compactness_and_specificity(directory)
     directory.gallery.write(**gallery)
-    directory.evaluation.write(figures)
+    directory.evaluation.write({MADE_BY: made_by()} | figures)
 
 
 def compactness_and_specificity(run: RunDirectory) -> dict[str, dict[str, float]]:

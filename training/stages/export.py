@@ -17,6 +17,7 @@ from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
+from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.space.generalisation import PrincipalComponents, summary, vertex_distances
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run, Stage, StageWarning, listed
@@ -24,7 +25,9 @@ from shapespace.training.stages.stage import Run, Stage, StageWarning, listed
 
 def export_bundle(run: Run) -> None:
     """Write the bundle; of a collection of meshes also ``encoded.json`` and ``least-near.npz``."""
-    folder = write_bundle_of(run, run.directory.evaluation.read())
+    figures = run.directory.evaluation.read()
+    figures.pop(MADE_BY, None)  # the manifest has its own origin
+    folder = write_bundle_of(run, figures)
     run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
     if not run.by_design:
         _encode_collection(run, folder)
@@ -99,7 +102,7 @@ def _encode_collection(run: Run, bundle: Path) -> None:
         "worst": str(names[worst]),
     }
     directory.least_near.write(given=given[worst], found=near[worst])
-    directory.encoded.write(facts)
+    directory.encoded.write({MADE_BY: made_by()} | facts)
     directory.log("encoded", **facts)
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.space.generalisation import FOLDS, folds, held_out, joined, summary
 from shapespace.training.space.modes import ModeError
 from shapespace.training.stages.stage import Run, Stage, StageWarning
@@ -19,12 +20,15 @@ def measure_generalisation(run: Run) -> None:
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
     shapes, original = given["vertices"], given["original"]
-    count = int(original.max()) + 1
+    count, first_step = int(original.max()) + 1, run.config.exponential.first_step
     some = folds(count)[: 1 if count >= 2 * FOLDS else None]
     facts: dict[str, Any]
     try:
         found = joined(
-            [held_out(reference, shapes, each, None, settings, material, original=original) for each in some]
+            [
+                held_out(reference, shapes, each, None, settings, material, original=original, first_step=first_step)
+                for each in some
+            ]
         )
     except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use
         facts = {"failed": str(error)}
@@ -44,7 +48,7 @@ def measure_generalisation(run: Run) -> None:
             "not_stuck": {name: summary(rows[-1][ended]) for name, rows in away.items() if ended.any()},
             "worst": str(given["names"][number]),
         }
-    directory.generalisation.write(facts)
+    directory.generalisation.write({MADE_BY: made_by()} | facts)
     directory.log("found", **facts)
 
 

@@ -22,8 +22,9 @@ def find_mean(run: Run) -> None:
     directory, material = run.directory, run.config.shell_material
     reference, given = directory.reference_mesh(), directory.shapes.read()
     shapes = given["vertices"]
-    steps = time_steps(run.config.modes, reference, shapes, material, given["original"])
-    found = centred_mean(reference, shapes, material, min(LIGHT_STEPS, steps))
+    first_step = run.config.exponential.first_step
+    steps = time_steps(run.config.modes, reference, shapes, material, given["original"], first_step)
+    found = centred_mean(reference, shapes, material, min(LIGHT_STEPS, steps), first_step=first_step)
     if found.status is not Status.CONVERGED:
         raise MeanError(_describe_failure(directory, found))
     facts = {"status": str(found.status), "iterations": found.iterations, "residual": found.residual, "steps": steps}
@@ -64,7 +65,12 @@ def _step_settings(modes: ModeSettings) -> ModeSettings:
 STAGE = Stage(
     name="mean",
     version=3,
-    settings=lambda config: [config.material, _step_settings(config.modes)],
+    # Without the table for the paper's first step: runs of version 0.2 had none, and are done.
+    settings=lambda config: [
+        config.material,
+        _step_settings(config.modes),
+        *([] if config.exponential.first_step == "paper" else [config.exponential]),
+    ],
     run=find_mean,
     results=lambda run: [run.mean.path],
     meshes_only=True,

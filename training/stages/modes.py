@@ -8,7 +8,7 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
-from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.codes import box_of, enough_steps, nearest_codes
 from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count, pga
@@ -24,7 +24,7 @@ def decompose(run: Run) -> None:
     settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()
     shapes, original_index = given["vertices"], given["original"]
     originals = original_index.max() + 1
-    space = ShellSpace(centre, config.shell_material)
+    space = ShellSpace(centre, config.shell_material, first_step=config.exponential.first_step)
     norm = WeightedNorm.of(centre, config.material.eta)
     steps = directory.log_steps()
     found = logarithms(space, centre.vertices, shapes, steps)
@@ -32,7 +32,10 @@ def decompose(run: Run) -> None:
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
     with waiting("sparse modes"):
         sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
-    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, steps)
+    shooting = steps
+    if settings.log_steps == "auto" and space.first_step == "centred" and steps > 1:
+        shooting = enough_steps(space, centre.vertices, sparse.vertices, sparse.coefficients)
+    codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, shooting)
     lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
@@ -58,6 +61,7 @@ def decompose(run: Run) -> None:
         "linearised_logarithms": len(found.fallbacks),
         "asked": count if settings.count == "auto" else settings.count,
         "log_steps": steps,
+        "exponential_steps": shooting,
         "steps": list(found.steps),
         "via": list(found.via),
         "codes": [str(status) for status in codes.status],

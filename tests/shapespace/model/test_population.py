@@ -30,6 +30,29 @@ def test_few_codes_shrink_correlations_and_keep_variances() -> None:
     assert (np.linalg.eigvalsh(found.covariance) > 0).all()
 
 
+def test_correlations_shrink_by_the_share_that_chance_has_in_their_squares() -> None:
+    """The formula of Ledoit and Wolf with variances kept, written out entry by entry (Schäfer and Strimmer 2005)."""
+    codes = _codes(12)
+    found, spread = Population.of(codes, WIDTH), codes.std(axis=0)
+    scores = (codes - codes.mean(axis=0)) / spread
+    chance, square, pairs = 0.0, 0.0, [(i, j) for i in range(3) for j in range(3) if i != j]
+    for i, j in pairs:
+        products = scores[:, i] * scores[:, j]
+        chance += products.var() / 12
+        square += products.mean() ** 2
+    assert 0.05 < chance / square < 0.95
+    for i, j in pairs:
+        kept = (1 - chance / square) * (scores[:, i] * scores[:, j]).mean()
+        assert np.isclose(found.covariance[i, j], kept * spread[i] * spread[j], rtol=1e-9)
+
+
+def test_chance_alone_leaves_no_correlation_and_none_leaves_all_but_a_millionth() -> None:
+    independent = Population.of(np.array([[1.0, 1], [1, -1], [-1, 1], [-1, -1]]), np.ones(2))
+    assert np.allclose(independent.covariance, np.eye(2), atol=1e-15)
+    together = Population.of(np.array([[1.0, 1], [-1, -1]]), np.ones(2))
+    assert np.isclose(together.covariance[0, 1], 1 - 1e-6, rtol=1e-12)
+
+
 def test_one_code_and_coordinates_that_never_differ_have_some_room() -> None:
     found = Population.of(np.zeros((1, 3)), WIDTH)
     assert np.allclose(np.sqrt(found.covariance.diagonal()), 1e-3 * WIDTH)

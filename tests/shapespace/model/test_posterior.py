@@ -78,18 +78,29 @@ def bumps(model: ShapeModel, size: float, width: float, rng: np.random.Generator
     return size * noise / np.sqrt((noise**2).mean())
 
 
+#: Standard deviations by which a figure may be off by chance.
+CHANCE = 3
+
+
 @pytest.mark.parametrize(
     ("name", "count", "width"),
     [
         ("model", 100, None),
         ("model", 100, 0.3),
-        pytest.param("figure", 24, None, marks=pytest.mark.long),
+        pytest.param("model", 667, None, marks=pytest.mark.long),
+        pytest.param("figure", 100, None, marks=pytest.mark.long),
         pytest.param("figure", 24, 0.05, marks=pytest.mark.long),
     ],
 )
 def test_the_truth_lies_in_the_intervals_of_a_noisy_mesh(
     request: pytest.FixtureRequest, name: str, count: int, width: float | None
 ) -> None:
+    """90 % of the true coordinates lie in intervals of 90 %, as exactly as the number of scores can tell.
+
+    Noise that is correlated between vertices is less exact. One number stands for its correlation in all directions,
+    and the fit follows the smooth part of the noise, which residuals then don't show. On this model, single coordinates
+    lie in their intervals in 82 to 99 % of 250 meshes, all together in 89 %.
+    """
     model: ShapeModel = request.getfixturevalue(name)
     rng = np.random.default_rng(0)
     scores = []
@@ -98,8 +109,12 @@ def test_the_truth_lies_in_the_intervals_of_a_noisy_mesh(
         noise = 0.005 * rng.standard_normal(shape.shape) if width is None else bumps(model, 0.005, width, rng)
         found = model.encode(shape + noise)
         scores.append(model.latents.shorter(found.code - code) / np.sqrt(np.diag(found.covariance)))
-    held = np.mean(np.abs(scores) < 1.645)
-    assert 0.75 < held < 0.99
+    held, square, draws = np.mean(np.abs(scores) < 1.645), np.mean(np.square(scores)), np.size(scores)
+    if width is None:
+        assert held == pytest.approx(0.9, abs=CHANCE * np.sqrt(0.9 * 0.1 / draws))
+        assert square == pytest.approx(1, abs=CHANCE * np.sqrt(2 / draws)), "covariances have the right size"
+    else:
+        assert 0.82 < held < 0.96
 
 
 def test_encode_keeps_what_is_fixed_and_draws_around_the_code(model: ShapeModel) -> None:

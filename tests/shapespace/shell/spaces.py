@@ -32,6 +32,7 @@ class FlatSpace:
 
     tolerance = 1e-12
     flat = True
+    centred = False
 
     def exponential(self, start: FloatArray, velocity: FloatArray, steps: int) -> FloatArray:
         return start + np.linspace(0, 1, steps + 1)[:, None, None] * velocity
@@ -72,6 +73,10 @@ class Shells:
     tolerance = 1e-6
     flat = False
 
+    @property
+    def centred(self) -> bool:
+        return self.space.first_step == "centred"
+
     def _path(self, vertices: FloatArray) -> DiscretePath:
         return DiscretePath(vertices=vertices, space=self.space, status=Status.CONVERGED)
 
@@ -109,8 +114,9 @@ class Shells:
         return without_rigid_motion(align(end, start) - start, start)
 
     def scaled(self, factor: float) -> Shells:
-        reference = self.space.reference
-        return Shells(ShellSpace(reference.with_vertices(factor * reference.vertices), self.space.material))
+        space, reference = self.space, self.space.reference
+        larger = reference.with_vertices(factor * reference.vertices)
+        return Shells(ShellSpace(larger, space.material, first_step=space.first_step))
 
 
 Space = FlatSpace | Shells

@@ -1,8 +1,11 @@
 """The exponential: its equations, its end points, and its reasons where it can't be continued."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
+from shapespace.mesh.rigid_motion import align
 from shapespace.shell.energy import Material
 from shapespace.shell.exponential import Renewals, exponential, extrapolate
 from shapespace.shell.geodesic import geodesic
@@ -29,6 +32,22 @@ def test_every_step_of_the_exponential_solves_its_equation(space, mesh, velocity
     assert path.converged
     assert len(path.vertices) == 9
     assert true_residuals(space, path).max() <= 1e-9
+
+
+@pytest.mark.parametrize(("mesh", "pose"), [("torus", 1.3)], indirect=True)
+def test_a_centred_first_step_is_a_hundred_times_closer_to_the_limit(mesh, velocity):
+    """Squared distances fall like 1/K² with the paper's step. Centred ones start far below and fall faster."""
+    centred, paper = (ShellSpace(mesh, Material(eta=1e-3), first_step=step) for step in ("centred", "paper"))
+    limit = exponential(centred, mesh.vertices, velocity, 128).vertices[-1]
+
+    def missed(space: ShellSpace, steps: int) -> float:
+        end = align(exponential(space, mesh.vertices, velocity, steps).vertices[-1], limit)
+        return float(((end - limit) ** 2).sum() / ((limit - mesh.vertices) ** 2).sum())
+
+    centred_misses, paper_misses = ([missed(space, steps) for steps in (4, 8, 16)] for space in (centred, paper))
+    assert max(new / old for new, old in zip(centred_misses, paper_misses, strict=True)) < 0.01
+    assert all(fine < coarse / 3 for coarse, fine in pairwise(centred_misses))
+    assert missed(paper, 128) > centred_misses[-1], "128 steps of the paper are worse than 16 centred ones"
 
 
 def test_a_rigid_part_of_the_velocity_changes_nothing(space, mesh, velocity):

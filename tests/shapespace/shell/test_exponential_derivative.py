@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.shell.energy import Material
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
-from shapespace.shell.space import DiscretePath
+from shapespace.shell.space import DiscretePath, ShellSpace
 from shapespace.solve.outcome import Status
 
 STEPS = 5
+
+
+@pytest.fixture(params=["centred", "paper"])
+def space(request, mesh) -> ShellSpace:
+    return ShellSpace(mesh, Material(eta=1e-3), first_step=request.param)
 
 
 @pytest.fixture

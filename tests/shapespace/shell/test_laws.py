@@ -14,6 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray
+from shapespace.shell.space import ShellSpace
 from tests.shapespace.shell.spaces import FlatSpace, Shells, Space
 
 K = 4
@@ -69,11 +70,18 @@ class Laws:
         assert case.space.distance(path[-1], case.end) < 1e-12
 
     def test_an_exponential_leaves_with_its_velocity(self, case: Case) -> None:
-        path = case.space.exponential(case.start, case.velocity, K)
-        assert len(path) == K + 1
-        np.testing.assert_array_equal(path[0], case.start)
-        left = K * case.space.difference(path[1], case.start) - case.velocity
-        assert case.norm(case.start, left) < 1e-7 * max(1, case.speed)
+        """Exactly with the paper's first step, and to first order with a centred step, which adds the acceleration."""
+        misses = []
+        for steps in (K, 2 * K):
+            path = case.space.exponential(case.start, case.velocity, steps)
+            assert len(path) == steps + 1
+            np.testing.assert_array_equal(path[0], case.start)
+            left = steps * case.space.difference(path[1], case.start) - case.velocity
+            misses.append(case.norm(case.start, left))
+        if case.space.centred:
+            assert misses[1] == pytest.approx(misses[0] / 2, rel=0.1)
+        else:
+            assert max(misses) < 1e-7 * max(1, case.speed)
 
     def test_without_velocity_nothing_moves(self, case: Case) -> None:
         for path in (
@@ -147,6 +155,8 @@ class Laws:
         coarse, fine = (np.abs(case.space.difference(b, a)).max() for a, b in pairwise(ends))
         if case.space.flat:
             assert coarse + fine < 1e-12
+        elif case.space.centred:
+            assert coarse / fine > 1.7, "not slower"
         else:
             assert coarse / fine == pytest.approx(2, abs=0.5), "neither slower nor faster"
 
@@ -220,6 +230,16 @@ class TestShells(Laws):
     @pytest.fixture
     def case(self, space, mesh, pose, velocity) -> Case:
         return Case(Shells(space), mesh.vertices, pose, velocity)
+
+
+@pytest.mark.parametrize(("mesh", "pose"), [("torus", 1.3)], indirect=True)
+class TestShellsWithThePapersFirstStep(Laws):
+    """As the paper and version 0.2 have it."""
+
+    @pytest.fixture
+    def case(self, space, mesh, pose, velocity) -> Case:
+        paper = ShellSpace(space.reference, space.material, first_step="paper")
+        return Case(Shells(paper), mesh.vertices, pose, velocity)
 
 
 class TestFlatSpace(Laws):

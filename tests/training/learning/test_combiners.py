@@ -19,10 +19,16 @@ from shapespace.coordinates.nric import nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.training.learning.combiners import kernels
 from shapespace.training.learning.combiners.combiner import CORRECTIONS, CombinerNetwork, choices
-from shapespace.training.learning.combiners.convolutions import EdgeConvolution, Flaps, Star, flaps
+from shapespace.training.learning.combiners.convolutions import (
+    ConvolutionCorrection,
+    EdgeConvolution,
+    Flaps,
+    Star,
+    flaps,
+)
 from shapespace.training.learning.combiners.correction import JointSamples, Slopes
 from shapespace.training.learning.combiners.kernels import KernelCorrection
-from shapespace.training.learning.combiners.patches import learned_metric
+from shapespace.training.learning.combiners.patches import LEARNING, _updated, learned_metric
 from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.export import to_onnx
 from shapespace.training.learning.fitting import read_network, save_network
@@ -305,6 +311,39 @@ def test_a_kernel_looks_at_no_other_patch(ball: TriangleMesh) -> None:
         moved = (correction.difference(changed) - correction.difference(y)).abs().amax(dim=0)
     assert len(correction.entries) > 1
     assert moved[other].max() == 0 < moved[here].min()
+
+
+def test_a_metric_is_the_fourth_root_of_the_gradients_outer_product() -> None:
+    """Here gradients are multiples of the axes, and the root of a root of their squares is left."""
+    sizes = torch.tensor([1.0, 0.25, 1 / 16], dtype=torch.float64)
+    metric = _updated(torch.eye(3).double(), torch.eye(3).double(), torch.zeros(2, 3).double(), torch.diag(sizes))
+    torch.testing.assert_close((metric @ metric.T).diagonal(), sizes)
+    assert LEARNING.power == 0.25, "found by trials: half of the consistent power"
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.4])
+def test_convolutions_drop_features_and_do_not_see_the_size_of_their_weights(
+    ball: TriangleMesh, dropout: float
+) -> None:
+    torch.manual_seed(0)
+    settings = ConvolutionSettings(layers=2, width=8, residual=False, dropout=dropout)
+    correction = ConvolutionCorrection(settings, ball, torch.randn(len(ball.edges), 2), 2, None)
+    y = torch.randn(3, 2, 2 * len(ball.edges))
+
+    def answer(seed: int) -> torch.Tensor:
+        torch.manual_seed(seed)
+        with torch.no_grad():
+            return correction.train()(y)
+
+    plain = answer(1)
+    assert torch.equal(plain, answer(2)) == (dropout == 0)
+    with torch.no_grad():
+        for convolution in correction.convolutions:
+            for parameter in convolution.parameters():
+                parameter.mul_(5)
+    torch.testing.assert_close(answer(1), plain, rtol=1e-3, atol=1e-3)
+    with torch.no_grad():
+        assert torch.equal(correction.eval()(y), correction(y)), "nothing is dropped after training"
 
 
 def test_a_learned_metric_finds_the_direction_that_matters() -> None:

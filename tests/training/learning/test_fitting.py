@@ -98,6 +98,16 @@ def test_the_rate_falls_on_a_plateau_and_ends_the_fit(data: tuple, tmp_path: Pat
     assert state["epoch"] < 500
 
 
+def test_on_a_plateau_the_rate_falls_to_a_tenth() -> None:
+    optimiser = torch.optim.SGD([torch.zeros(1)], 1e-2)
+    schedule = fitting._schedule(optimiser, FitSettings(schedule="plateau", patience=1))
+    rates = []
+    for _ in range(5):
+        schedule.step(1.0)
+        rates.append(optimiser.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-2, 1e-2, 1e-3, 1e-3, 1e-4])
+
+
 def test_a_fit_has_as_many_epochs_as_fit_into_its_time(
     data: tuple, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import bundled, fit, generalisation, pages, results, served, stages, verdict
+from shapespace.training.report.number_format import r2, short_of
+from shapespace.training.runs.provenance import made_by
 
 WRITERS: dict[str, Callable[[], None]] = {
     "bundled": lambda: pages.write("bundled", bundled.page()),
@@ -29,6 +31,35 @@ def test_a_committed_page_of_measurements_is_what_its_module_writes(
     assert (tmp_path / f"{name}.md").read_text(encoding="utf-8") == committed
 
 
+@pytest.mark.parametrize(
+    "file", sorted(pages.ROOT.glob("runs/**/*.json")), ids=lambda file: f"{file.parent.name}-{file.stem}"
+)
+def test_a_file_of_figures_says_what_made_it(file: Path) -> None:
+    """Kinds of machines were not recorded before version 0.3."""
+    made = json.loads(file.read_text(encoding="utf-8"))["made_by"]
+    assert made.keys() == made_by().keys()
+    assert made["version"]
+    assert made["commit"]
+
+
+def test_figures_are_written_with_what_made_them(tmp_path: Path) -> None:
+    for found in ([{"mean": 1.5}], {"mean": 1.5}):
+        pages.write_figures(tmp_path / "new" / "figures.json", found)
+        read = pages.read_figures(tmp_path / "new" / "figures.json")
+        assert read == (found if isinstance(found, list) else {"made_by": made_by()} | found)
+        assert json.loads((tmp_path / "new" / "figures.json").read_text(encoding="utf-8"))["made_by"] == made_by()
+    assert made_by()["machine"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.99994, "0.9999"), (0.99996, "0.99996"), (0.9999996, "0.9999996"), (1, "1.0000"), (-2, "-2.0000")],
+)
+def test_no_r2_rounds_up_to_one(value: float, text: str) -> None:
+    assert r2(value) == text
+    assert short_of(100 * value, 1, 100) != "100.0" or value == 1
+
+
 def test_the_verdict_and_its_chart_are_what_the_runs_say() -> None:
     found = verdict.collections()
     assert verdict.page(found) == verdict.PAGE.read_text(encoding="utf-8")
@@ -42,11 +73,11 @@ def test_the_verdict_and_its_chart_are_what_the_runs_say() -> None:
 def test_a_simple_model_that_is_measured_later_is_in_the_verdict(tmp_path: Path) -> None:
     shutil.copytree(verdict.RUNS, tmp_path, dirs_exist_ok=True)
     file = tmp_path / "collections" / "hand.json"
-    folds = json.loads(file.read_text(encoding="utf-8"))
+    folds = pages.read_figures(file)
     for fold in folds:
         for rival, share in (("linear skinning", 0.25), ("a worse one", 1.5)):
             fold["unseen"][rival] = {key: share * value for key, value in fold["unseen"]["components"].items()}
-    file.write_text(json.dumps(folds), encoding="utf-8")
+    pages.write_figures(file, folds)
     found = verdict.collections(tmp_path)
     assert "for hands (0.25): linear skinning." in verdict.page(found, tmp_path)
     chart = tmp_path / "chart.svg"

@@ -117,8 +117,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "evaluation.json": {
             "eta": 0.01,
             "test_samples": 80,
-            "r2": {"composite": score(0.9876), "monolithic": score(0.8765)},
+            "r2": {"composite": score(0.9876), "monolithic": score(0.8765), "limit": score(0.8123)},
             "fresh": {"codes": 50, "failed": 1, "r2": {"composite": score(0.6789)}, "steps": score(0.7891)},
+            "limit": {
+                "steps": 64,
+                "codes": 10,
+                "composite": {"vertices": {"mean": 0.031, "max": 0.0456}},
+                "exponentials": {"r2": score(0.8912), "vertices": {"mean": 0.001, "max": 0.002}},
+            },
             "affine_samples": 80,
             "correction": {"kind": "field", "tried": {"kernel": 0.0123, "field": 0.00456}},
             "r2_factors": {"head": score(0.9), NASTY: score(0.8)},
@@ -226,6 +232,7 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
     for said in ("Sphere & Co <b>", "0.9876", "0.8765", "0.7765", "1.2 %", "4.2 ms", "12.3 MB", "without <i>this</i>",
                  "SPGA 0.7531, PGA 0.8531", "a perceptron at every edge. Its error on held-out codes is 0.46 % of",
                  "kernel ridge regression 1.2 %", "49 codes drawn after training", "0.7891",
+                 "R² against 64 time steps", "0.8123", "0.8912", "3.1 %",
                  # Figures that the page's code doesn't name.
                  "4,321", "seeds · 0 · r2 · composite · total", "0.5432"):  # fmt: skip
         assert said in words

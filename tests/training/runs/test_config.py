@@ -8,6 +8,7 @@ import pytest
 from shapespace.training.collection.generators import MESHES, PRODUCTS
 from shapespace.training.runs.config import Config, ConfigError, load, parse
 from shapespace.training.runs.settings import CollectionSettings
+from shapespace.training.stages.run import stage_keys
 from tests.training.conftest import TINY
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "examples").rglob("*.toml"))
@@ -99,3 +100,24 @@ def test_settings_that_only_version_0_2_used_are_accepted_and_named() -> None:
     runs = Path(__file__).parents[3] / "runs"
     assert load(runs / "freaky-torus" / "config.toml")[0].unused == ["networks.seeds", "variants"]
     assert not load(Path(__file__).parents[3] / "examples" / "freaky-torus.toml")[0].unused
+
+
+def test_a_run_of_version_0_2_keeps_the_papers_first_step_and_a_new_one_names_its_own(tmp_path: Path) -> None:
+    mine, stored = tmp_path / "here.toml", tmp_path / "config.toml"
+    mine.write_text(TINY.replace("freaky-torus", "figure", 1))
+    new, text = load(mine, stored=stored)
+    assert new.exponential.first_step == "centred"
+    stored.write_text(text)
+    assert load(stored, stored=stored) == (new, text), "a run that is continued"
+    assert load(mine, stored=stored) == (new, text)
+    stored.write_text(mine.read_text())  # as version 0.2 did
+    old, kept = load(mine, stored=stored)
+    assert (old.exponential.first_step, kept) == ("paper", mine.read_text())
+    stored.write_text("damaged [")
+    assert load(mine, stored=stored)[0] == new, "as if there were no run"
+    stored.write_text(mine.read_text())
+    mine.write_text(f'{mine.read_text()}\n[exponential]\nfirst_step = "centred"\n')
+    asked, text = load(mine, stored=stored)
+    assert (asked.exponential.first_step, text) == ("centred", mine.read_text())
+    assert stage_keys(old, "")["ingest"] == stage_keys(asked, "")["ingest"]
+    assert stage_keys(old, "")["mean"] != stage_keys(asked, "")["mean"]

@@ -9,7 +9,8 @@ from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space import codes
+from shapespace.training.space.codes import STEPS_ERROR, box_of, enough_steps, nearest_codes
 from shapespace.training.space.modes import mode_count, pga
 
 STEPS = 4
@@ -90,3 +91,14 @@ def test_as_many_modes_as_pay(space, rng):
     assert mode_count(ModeSettings(), space, x, fields[:2]) == 1
     assert mode_count(ModeSettings(), space, x, fields[:1]) == 1
     assert mode_count(ModeSettings(), space, x, np.repeat(fields[:1], 6, axis=0)) == 1
+
+
+def test_the_number_of_steps_grows_with_the_distance_of_the_codes(
+    space: ShellSpace, modes: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codes, "STEPS_CODES", 4)
+    mean, near = space.reference.vertices, np.array([[-1.0, -1.0], [1.0, 1.0]])
+    few, more = (enough_steps(space, mean, modes, reach * near, workers=1) for reach in (0.3, 3))
+    assert few == 8
+    assert more > few
+    assert STEPS_ERROR == 1e-5, "a tenth of the error of good networks"

@@ -47,11 +47,11 @@ def test_nothing_is_known_of_what_is_held_out(ellipsoid, shapes):
 
 def test_one_step_is_chosen_where_shapes_neither_bend_nor_fold(ellipsoid, shapes, blends):
     mesh, linear = blends
-    assert time_steps(ModeSettings(), ellipsoid, shapes, Material()) == 16
+    assert time_steps(ModeSettings(), ellipsoid, shapes, Material()) == 8
     assert time_steps(ModeSettings(log_steps=3), mesh, linear, Material()) == 3
-    assert time_steps(ModeSettings(), mesh, linear[:4], Material()) == 16, "too few to tell"
+    assert time_steps(ModeSettings(), mesh, linear[:4], Material()) == 8, "too few to tell"
     wide = mesh.vertices + 6 * (linear - mesh.vertices)
-    assert time_steps(ModeSettings(), mesh, wide, Material()) == 16, "in one step they fold"
+    assert time_steps(ModeSettings(), mesh, wide, Material()) == 8, "in one step they fold"
 
 
 @pytest.mark.long

@@ -53,7 +53,7 @@ def test_a_run_without_a_mean_ends_with_the_place(tmp_path: Path) -> None:
     run.directory.shapes.write(names=np.array(["one", "three"]), vertices=shapes[[0, 2]], original=np.arange(2))
     find_mean(run)
     found = run.directory.mean.read()
-    assert (found["status"], found["steps"]) == ("converged", 16)
+    assert (found["status"], found["steps"]) == ("converged", 8)
 
 
 @pytest.mark.parametrize(("given", "steps"), [(None, 1), pytest.param(3, 3, marks=pytest.mark.long)])
@@ -75,4 +75,4 @@ def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     straight = found.reference.vertices + np.tensordot(code, found.modes, axes=1)
     away = np.abs(align(found.shapes(code[None]).vertices[0], straight) - straight).max()
     assert away < 1e-12 if steps == 1 else away > 1e-4
-    assert (found.finer is None) == (steps == 1), "one step approximates no geodesic"
+    assert (found.limit is None) == (steps == 1), "one step approximates no geodesic"

@@ -22,7 +22,8 @@ def test_no_stage_of_a_run_of_version_0_2_is_done_again(name: str, tmp_path: Pat
     directory, said = RunDirectory(tmp_path), list[str]()
     for stage, stamp in STAMPS[name].items():
         directory.stamp(stage).write(stamp)
-    run = Run(tmp_path, *load(RUNS / name / "config.toml"), tmp_path / "models")
+    stored = RUNS / name / "config.toml"
+    run = Run(tmp_path, *load(stored, stored=stored), tmp_path / "models")
     assert not execute(run, "evaluation", show=said.append)  # there is no bundle
     assert said[0].startswith("networks.seeds")
     assert "python -m benchmarks.studies" in said[0]

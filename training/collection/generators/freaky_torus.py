@@ -9,6 +9,7 @@ import numpy as np
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.shell.space import FirstStep
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.sampling import FeaturePositions, SampledShapes
 
@@ -101,7 +102,8 @@ class FreakyTorus:
     coordinates = Coordinates(np.zeros(4), np.full(4, PERIOD), np.full(4, PERIOD))
     codes = np.empty((0, 4))
     #: A formula has no steps and is exact, and the convolutions for this collection don't learn from derivatives.
-    steps = finer = differentiated = None
+    steps = limit = differentiated = None
+    first_step: FirstStep = "paper"
     #: Sizes of the shapes; the reference always has the paper's.
     form = PAPER
 
