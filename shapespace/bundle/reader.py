@@ -44,6 +44,7 @@ class Bundle(Geometry):
     # byte of the bundle.
     digest: str
     networks: Mapping[str, bytes]  # content of each ONNX file by name
+    folder: Path  # where it was read
 
 
 def check_place(folder: Path) -> None:
@@ -85,7 +86,13 @@ def read_bundle(folder: Path, digest: str | None = None) -> Bundle:
             finest = geometry.fine.reference if geometry.fine else geometry.reference
             _check_decoder(network, manifest.decoder, manifest.latent_dimension, len(finest.vertices))
         _check_weights(file, network)
-    return Bundle(manifest=manifest, digest=hashlib.sha256(text).hexdigest(), networks=files, **vars(geometry))
+    return Bundle(
+        manifest=manifest,
+        digest=hashlib.sha256(text).hexdigest(),
+        networks=files,
+        folder=folder,
+        **vars(geometry),
+    )
 
 
 def read_files(folder: Path, manifest: Manifest) -> dict[str, bytes]:
