@@ -190,6 +190,16 @@ class Reconstructor:
         forces = jacobian.T @ (changes * self.norm.squared).T
         return factor.solve(forces.T).reshape(len(changes), -1, 3)
 
+    def exact_differential(self, vertices: FloatArray, target: FloatArray, changes: FloatArray) -> FloatArray:
+        """Compute the same changes exactly at a minimum: with the second derivatives of lengths and angles, which count
+        where the target z* (2E,) is not integrable.
+        """
+        point = self._squares(vertices, target)
+        second = point.geometry.second_derivatives()
+        entries = point.entries() + self.normal_matrix.second_derivative(second, self.norm.squared * point.misfit)
+        forces = self.jacobian.matrix(point.gradients).T @ (changes * self.norm.squared).T
+        return self.solver.double.factorise(entries).solve(forces.T).reshape(len(changes), -1, 3)
+
     def sensitivity(self, vertices: FloatArray, fields: FloatArray) -> FloatArray:
         """Apply the transpose of ``differential``.
 

@@ -24,6 +24,7 @@ from shapespace.model.encode import Encoded, Encoder
 from shapespace.model.fit import Fitter
 from shapespace.model.fit_result import Fitted
 from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched, points_and_faces
+from shapespace.model.jacobian import NetworkDerivatives, shape_jacobian
 from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
@@ -212,6 +213,37 @@ class ShapeModel:
                 stacklevel=3,  # the decorator's frame lies between,
             )
         return positions if values.ndim == 2 else positions[0]
+
+    @OneBlasThread()
+    def jacobian(self, code: ArrayLike, mesh: MeshName = "fine") -> FloatArray:
+        """Return the derivatives of a shape's positions by its code.
+
+        They are exact for the full shape: derivatives of the networks, and of the minimum that Gauss–Newton finds. The
+        first call reads the networks again.
+
+        Args:
+            code: code (m,); inside or outside the bounds.
+            mesh: "fine" or "coarse".
+
+        Returns:
+            Derivatives (V, 3, m), in the units of the training meshes for each unit of a coordinate.
+
+        Raises:
+            LatentError: the code has the wrong length or is not finite, or its shape has no derivative.
+            BundleError: a network has operators whose derivatives are not known.
+            ModelFailedError: the networks failed at the code, or took too long.
+
+        >>> import numpy as np, shapespace
+        >>> model = shapespace.load("models/figure")
+        >>> model.jacobian(np.zeros(20)).shape
+        (4601, 3, 20)
+        """
+        checked, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist())
+        return shape_jacobian(self.decoder, self._network_derivatives, checked, MeshChoice(mesh))
+
+    @cached_property
+    def _network_derivatives(self) -> NetworkDerivatives:
+        return NetworkDerivatives(self.decoder, read_bundle(self.folder, self.digest).networks)
 
     @OneBlasThread()
     def blend_shapes(self, mesh: MeshName = "fine") -> BlendShapes:

@@ -127,6 +127,7 @@ hidden = [16]
 {evaluation}
 
 [export]
+decoder = false
 name = "{name}"
 title = "{name.capitalize()}"
 description = "A run for the tests."

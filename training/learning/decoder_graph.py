@@ -175,18 +175,23 @@ def _append(
 
 
 def _short_indices(graph: onnx.GraphProto) -> None:
-    """Store the indices of gathers in 32 bits."""
+    """Store the indices of gathers in 16 bits where they are small, and in 32 bits elsewhere."""
     users: dict[str, set[tuple[str, int]]] = {}
     for node in reversed(graph.node):
         for k, name in enumerate(node.input):
             # A network may bring an index into another form before.
             through = users.get(node.output[0], set()) if (node.op_type, k) == ("Reshape", 0) else {(node.op_type, k)}
             users.setdefault(name, set()).update(through)
-    for tensor in graph.initializer:
-        if tensor.data_type == TensorProto.INT64 and users.get(tensor.name) == {("Gather", 1)}:
-            values = numpy_helper.to_array(tensor)
-            if np.abs(values).max(initial=0) < 2**31:
-                tensor.CopyFrom(numpy_helper.from_array(values.astype(np.int32), tensor.name))
+    for tensor in list(graph.initializer):
+        if tensor.data_type != TensorProto.INT64 or users.get(tensor.name) != {("Gather", 1)}:
+            continue
+        name, values = tensor.name, numpy_helper.to_array(tensor)
+        if values.size >= NARROWED_SIZE and np.abs(values).max() <= FixedPoint.MOST:
+            graph.initializer.remove(tensor)
+            for node in reversed(_from_bytes(graph, values, name, name, TensorProto.INT32)):
+                graph.node.insert(0, node)
+        elif np.abs(values).max(initial=0) < 2**31:
+            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.int32), name))
 
 
 def _share(graph: onnx.GraphProto) -> None:
@@ -218,10 +223,9 @@ def _narrow(graph: onnx.GraphProto, codes: Codes, size: float) -> None:
         away[name] = float((np.linalg.norm(moved, axis=2).max() / size) ** 2)
     total = 0.0
     for name in sorted(wide, key=lambda name: away[name] / found[name].whole.size):
-        total += away[name]
-        if total > NARROWING**2:
-            break
-        found[name].store(graph, wide[name])
+        if total + away[name] <= NARROWING**2:
+            total += away[name]
+            found[name].store(graph, wide[name])
 
 
 def _is_wide(tensor: TensorProto) -> bool:
@@ -239,7 +243,7 @@ class FixedPoint:
     rows: NDArray[np.float32]  # (…, r, 1), or (1,) for short rows
     columns: NDArray[np.float32]  # (…, 1, c)
 
-    #: The largest integer that two signed bytes hold, the lower one rounded to the nearest multiple of 256.
+    #: The largest integer, which two signed bytes hold.
     MOST = 127 * 256
     #: Fewest columns with which each row has a factor.
     WIDE = 8
@@ -279,23 +283,23 @@ def _positive(sizes: NDArray) -> NDArray:
     return np.where(sizes > 0, sizes, 1)
 
 
-def _from_bytes(graph: onnx.GraphProto, whole: NDArray, store: str, target: str) -> list[onnx.NodeProto]:
+def _from_bytes(
+    graph: onnx.GraphProto, whole: NDArray, store: str, target: str, kind: int = TensorProto.FLOAT
+) -> list[onnx.NodeProto]:
     """Store integers of 16 bits as two of 8 bits, since TensorRT has none of 16 bits; return nodes that join them."""
-    high = np.rint(whole / 256).astype(np.int32)
-    parts = {"high": high, "low": whole - 256 * high}
+    high = (whole + 128) // 256
     if f"{store}.high" not in {tensor.name for tensor in graph.initializer}:
-        for part, values in parts.items():
-            # 128 is rounded to 127, which is one unit of 16 bits.
-            tensor = numpy_helper.from_array(values.clip(-127, 127).astype(np.int8), f"{store}.{part}")
-            graph.initializer.append(tensor)
-        graph.initializer.append(numpy_helper.from_array(np.array(256, np.float32), f"{store}.256"))
+        for part, values in {"high": high, "low": whole - 256 * high}.items():
+            graph.initializer.append(numpy_helper.from_array(values.astype(np.int8), f"{store}.{part}"))
+        unit = np.array(256, helper.tensor_dtype_to_np_dtype(kind))
+        graph.initializer.append(numpy_helper.from_array(unit, f"{store}.256"))
     return [
         *(
-            helper.make_node("Cast", [f"{store}.{part}"], [f"{target}.{part}.real"], to=TensorProto.FLOAT)
-            for part in parts
+            helper.make_node("Cast", [f"{store}.{part}"], [f"{target}.{part}.wide"], to=kind)
+            for part in ("high", "low")
         ),
-        helper.make_node("Mul", [f"{target}.high.real", f"{store}.256"], [f"{target}.large"]),
-        helper.make_node("Add", [f"{target}.large", f"{target}.low.real"], [target]),
+        helper.make_node("Mul", [f"{target}.high.wide", f"{store}.256"], [f"{target}.large"]),
+        helper.make_node("Add", [f"{target}.large", f"{target}.low.wide"], [target]),
     ]
 
 
@@ -304,8 +308,7 @@ def _split_integers(graph: onnx.GraphProto) -> None:
     for tensor in [tensor for tensor in graph.initializer if tensor.data_type == TensorProto.INT16]:
         whole, name = numpy_helper.to_array(tensor).astype(np.int32), tensor.name
         users = [node for node in graph.node if name in node.input]
-        exact = np.abs(whole - 256 * np.rint(whole / 256)).max() < 128 and np.abs(whole).max() <= FixedPoint.MOST
-        if not exact or any(node.op_type != "Cast" or node.attribute[0].i != TensorProto.FLOAT for node in users):
+        if np.abs(whole).max() > FixedPoint.MOST or any(node.op_type != "Cast" or node.attribute[0].i != TensorProto.FLOAT for node in users):
             continue
         graph.initializer.remove(tensor)
         for user in users:
