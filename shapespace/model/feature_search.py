@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric, wrap
@@ -42,7 +43,7 @@ class FeatureSearch:
         )
 
     def another(
-        self, reconstruct: Reconstructor, code: FloatArray, pairs: Pairs, movable: FloatArray
+        self, reconstruct: Reconstructor, code: FloatArray, pairs: Pairs, movable: NDArray[np.bool_]
     ) -> FloatArray | None:
         """Move one factor of a code (m,) to the node that explains the distances of a scan best.
 

@@ -148,8 +148,8 @@ class FitSearch:
         """Move a feature to its most promising place in the scan, as long as the fit improves with so many steps."""
         for _ in features.images:
             code = features.another(self._reconstruct, state.code, self._pairs(state), self.constraints.movable)
-            moved = None if code is None else self.start(code, state.placement, state.shape)
-            if moved is None or (moved := self.run(moved, steps, first=False)).cost >= state.cost:
+            begun = None if code is None else self.start(code, state.placement, state.shape)
+            if begun is None or (moved := self.run(begun, steps, first=False)).cost >= state.cost:
                 break
             state = moved
         return state

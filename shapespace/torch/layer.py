@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from shapespace.bundle.finding import find_bundle
 from shapespace.bundle.reader import Bundle, read_bundle
 from shapespace.coordinates.frame_integration import FrameIntegration
 from shapespace.torch.arrays import ArrayModule
@@ -77,7 +77,7 @@ class ShapeLayer(nn.Module):
     server's drafts (``quality="draft"``). The layer has no parameters: codes are the variables.
 
     Args:
-        folder: folder NAME/VERSION of a bundle.
+        folder: folder NAME/VERSION of a bundle, or a name, as for `shapespace.load`.
         dtype: type of codes and positions, ``torch.float32`` or ``torch.float64``. ``.double()`` and ``.float()``
             change it later, and read the bundle again, so that nothing is rounded twice.
 
@@ -107,7 +107,7 @@ class ShapeLayer(nn.Module):
 
     def __init__(self, folder: str | os.PathLike[str], dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
-        self._folder = os.path.abspath(folder)
+        self._folder = find_bundle(folder)
         bundle = self._read(dtype)
         finest = bundle.fine.reference if bundle.fine else bundle.reference
         self.names = list(bundle.manifest.latent_names)
@@ -118,7 +118,7 @@ class ShapeLayer(nn.Module):
     def _read(self, dtype: torch.dtype) -> Bundle:
         if dtype not in (torch.float32, torch.float64):
             raise TypeError(f"a shape layer computes in torch.float32 or torch.float64, not in {dtype}")
-        bundle = read_bundle(Path(self._folder))
+        bundle = read_bundle(self._folder)
         self.decoded = DecodedShapes(bundle, dtype)
         return bundle
 
