@@ -308,7 +308,9 @@ def _split_integers(graph: onnx.GraphProto) -> None:
     for tensor in [tensor for tensor in graph.initializer if tensor.data_type == TensorProto.INT16]:
         whole, name = numpy_helper.to_array(tensor).astype(np.int32), tensor.name
         users = [node for node in graph.node if name in node.input]
-        if np.abs(whole).max() > FixedPoint.MOST or any(node.op_type != "Cast" or node.attribute[0].i != TensorProto.FLOAT for node in users):
+        if np.abs(whole).max() > FixedPoint.MOST or any(
+            node.op_type != "Cast" or node.attribute[0].i != TensorProto.FLOAT for node in users
+        ):
             continue
         graph.initializer.remove(tensor)
         for user in users:
