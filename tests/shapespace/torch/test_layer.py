@@ -73,7 +73,7 @@ def test_layer_moves_between_processes_and_types(layer: ShapeLayer) -> None:
         assert torch.equal(twin(codes), layer(codes))
         again = twin.double().float()
         assert torch.equal(again(codes), layer(codes))
-    with pytest.raises(TypeError, match="not in torch.float16"):
+    with pytest.raises(TypeError, match=r"not in torch\.float16"):
         twin.half()
 
 
