@@ -83,6 +83,11 @@ class OpenPage:
         """Whether the drawn shape is a draft or full."""
         return self.page.locator(".stage").get_attribute("data-quality")
 
+    @property
+    def waits(self) -> bool:
+        """Whether the drawn shape, if any, is marked as that of another code."""
+        return self.page.locator(".stage").get_attribute("aria-busy") == "true"
+
     def __getitem__(self, selector: str) -> Locator:
         return self.page.locator(selector)
 
@@ -137,11 +142,11 @@ class OpenPage:
         return pixels(self.page.screenshot(clip=clip))
 
     def until_different(self, before: np.ndarray, share: float = 0.002) -> np.ndarray:
-        """Wait until the picture differs from another, and return it."""
+        """Wait until the picture differs from another and shows the shape of the code, and return it."""
 
         def changed() -> np.ndarray | None:
             now = self.picture()
-            return now if difference(before, now) > share else None
+            return now if difference(before, now) > share and not self.waits else None
 
         return self.eventually(changed)
 

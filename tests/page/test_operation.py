@@ -1,5 +1,6 @@
 """The page as a whole: models, errors, a server that stops and starts, accessibility, download size."""
 
+import json
 import re
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import httpx
 import numpy as np
 import pytest
 
+from shapespace.service.http.problems import KINDS
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage, difference
 from tests.service.bundles import write_bundle
@@ -75,14 +77,31 @@ def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> 
 def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
     studio = window(complains=True).open()
     before = studio.picture()
-    studio.type(0, 1e39)
+    refusal = json.dumps({"type": "urn:shapespace:problem:not-finite", "detail": "Send finite numbers for latents."})
+    studio.page.route("**/vertices*", lambda route: route.fulfill(status=422, body=refusal))
+    studio.type(0, 0.12)
     message = studio.eventually(lambda: studio["#messages .error"].first.inner_text() or None)
-    assert "Send finite numbers" in message
+    assert "A number is too large for a shape" in message
+    assert "latents" not in message, "the server's words are for programs"
     assert studio["#messages"].get_attribute("aria-live") == "polite"
+    # The shape of the code before stays, in grey, and nothing vouches for it.
+    assert "stale" in (studio[".stage"].get_attribute("class") or "")
+    assert studio["#diagnostics summary"].inner_text() == "No shape for these values"
+    assert studio["#busy"].is_hidden()
     studio["#messages .error button"].first.click()
     assert studio["#messages .error"].count() == 0
+    studio.page.unroute("**/vertices*")
     studio.type(0, 0.1)
     studio.until_different(before)
+    assert "stale" not in (studio[".stage"].get_attribute("class") or "")
+
+
+def test_every_problem_of_the_server_has_words_for_people(studio: OpenPage) -> None:
+    texts = studio.page.evaluate("async () => (await import('/page/js/server/problems.js')).TEXTS")
+    assert {*texts} == {*KINDS}
+    for kind, text in texts.items():
+        assert re.fullmatch(r"[^?=&{}`/]+\.", text), kind
+        assert not re.search(r"JSON|HTTP|Content-Type|Accept|parameter|header|latent|\bSend\b", text), kind
 
 
 def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, models: Path) -> None:

@@ -72,6 +72,74 @@ def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio:
     studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
 
 
+def test_a_number_beyond_the_slider_is_refused_with_its_bound(studio: OpenPage) -> None:
+    studio.asked.clear()
+    box = studio.coordinate(0).locator("input[type=number]")
+    line = studio.coordinate(0).locator(".bound")
+    for typed, words, end in ((99, "largest", 0.32), (-99, "smallest", -0.32), (1e39, "largest", 0.32)):
+        box.fill(str(typed))
+        assert line.inner_text() == f"The {words} value here is {end}."
+        assert box.get_attribute("aria-invalid") == "true"
+        assert float(box.input_value()) == typed, "it may be the beginning of another number"
+        box.press("Enter")
+        assert float(box.input_value()) == end
+        assert box.get_attribute("aria-invalid") == "false"
+        studio.until_code([end, 0, 0])
+    box.fill("0.1")
+    assert line.is_hidden()
+    studio.until_code([0.1, 0, 0])
+    studio.rest()
+    assert all(abs(asked["latents"][0][0]) < 0.4 for asked in studio.asked)
+
+
+def test_a_shape_of_another_code_is_grey_below_a_ring_and_has_no_verdict(studio: OpenPage) -> None:
+    held: list[Route] = []
+    free = False
+    before = studio.picture()
+    studio.page.route("**/vertices*", lambda route: route.continue_() if free else held.append(route))
+    studio.type(2, 0.5)
+    studio.eventually(lambda: studio.waits)
+    assert studio["#busy"].is_visible()
+    assert studio["#diagnostics summary"].inner_text() == "Computing this shape …"
+    assert studio["#found li"].count() == 0
+    grey = studio.picture()
+    clay = (before[..., 0] - before[..., 2]) > 20
+    assert clay.mean() > 0.05
+    assert ((grey[..., 0] - grey[..., 2])[clay] > 20).mean() < 0.05
+    free = True
+    for route in held:
+        route.continue_()
+    studio.rest()
+    assert not studio.waits
+    assert studio["#busy"].is_hidden()
+    assert studio["#found li"].count() > 1
+
+
+def test_the_verdict_is_that_of_the_draft_on_the_screen(studio: OpenPage) -> None:
+    studio.page.route("**/vertices*", lambda route: '"full"' in (route.request.post_data or "") or route.continue_())
+    studio.type(2, 1.2)
+    studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
+    assert studio.quality == "draft"
+    studio.type(2, 0.5)
+    studio.eventually(lambda: "Inside the range" in (studio["#diagnostics"].text_content() or ""))
+    assert studio.quality == "draft"
+    studio.page.unroute("**/vertices*")
+
+
+def test_random_draws_likely_shapes_unless_the_menu_says_otherwise(window: Open) -> None:
+    studio = window().open("#model=figure")
+    asked: list[dict[str, object]] = []
+    studio.page.on("request", lambda request: "/sample" in request.url and asked.append(request.post_data_json))
+    studio["#random"].click()
+    studio.eventually(lambda: any(studio.code))
+    likely = studio.code
+    studio["#distribution"].select_option("uniform")
+    studio.eventually(lambda: studio.code != likely and len(asked) == 2)
+    assert [body["distribution"] for body in asked] == ["population", "uniform"]
+    assert asked[0]["seed"] == asked[1]["seed"]
+    assert np.abs(likely).mean() < np.abs(studio.code).mean()
+
+
 def test_an_angle_goes_round(studio: OpenPage) -> None:
     studio.type(1, 4)
     studio.until_code([0, 4 - 2 * np.pi, 0])

@@ -1,6 +1,7 @@
 /** Reads and writes the state of the page in the part of its address after the #. */
 
 import { Matrix4, Quaternion, Vector3 } from "three";
+import { codeIn } from "./server/space.js";
 import { OTHER } from "./view/colouring.js";
 
 const COLOURS = ["stretch", "bending", "distance"];
@@ -65,21 +66,23 @@ export function fromHash(hash, models) {
   const model = models.find(({ name }) => name === parts.get("model"));
   if (!model) return { missing: parts.get("model") };
   const m = model.latent_dimension;
-  const isCode = (code) => code.length === m && code.every(Number.isFinite);
-  const code = unlist(parts.get("z") ?? "");
-  const keyframes = (parts.get("keys") ?? "").split(";").map(unlist).filter(isCode);
+  const keyframes = (parts.get("keys") ?? "").split(";").flatMap((text) => {
+    const code = codeIn(text, m);
+    return code ? [code] : [];
+  });
   const flags = (parts.get("show") ?? "").split(",");
   const locked = (parts.get("locked") ?? "").split(",").filter(Boolean).map(Number);
   const against = Number(parts.get("against") ?? -1);
-  const other = unlist(parts.get("other") ?? "");
-  const isThere = against === OTHER ? isCode(other) : Number.isInteger(against) && against < keyframes.length;
+  const other = codeIn(parts.get("other"), m);
+  const isThere =
+    against === OTHER ? Boolean(other) : Number.isInteger(against) && against < keyframes.length;
   const view = unlist(parts.get("view") ?? "");
   const beyond = Number(parts.get("beyond"));
   const seconds = Number(parts.get("seconds"));
   const colour = parts.get("colour");
   return {
     model,
-    code: isCode(code) ? code : null,
+    code: codeIn(parts.get("z"), m),
     keyframes,
     locked: Array.from({ length: m }, (_, k) => locked.includes(k)),
     pins: (parts.get("pins") ?? "").split(";").flatMap(toPin),
@@ -90,7 +93,7 @@ export function fromHash(hash, models) {
       fine: !flags.includes("coarse"),
       colour: COLOURS.includes(colour) ? colour : "none",
       against: isThere ? Math.max(against, OTHER) : -1,
-      other: isCode(other) ? other : null,
+      other,
       seconds: seconds >= 0.5 && seconds <= 120 ? seconds : null,
       easing: parts.get("easing") === "soft" ? "soft" : "even",
       beyond: beyond > 0 && beyond <= 1 ? beyond : 0,

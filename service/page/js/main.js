@@ -13,11 +13,12 @@ import { Strip } from "./path/strip.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import * as api from "./server/api.js";
+import { listed, preferred } from "./server/first.js";
 import { ShapeLoop } from "./server/shape-loop.js";
 import { LatentSpace, sameCode } from "./server/space.js";
 import { openCard } from "./shape/card.js";
-import { inShort, inWords } from "./shape/diagnostics.js";
 import { Names, namesOf } from "./shape/names.js";
+import { OnScreen } from "./shape/on-screen.js";
 import { Pins } from "./shape/pins.js";
 import { Pull } from "./shape/pull.js";
 import { Sliders } from "./shape/sliders.js";
@@ -33,7 +34,7 @@ import { Pose } from "./view/pose.js";
 import { Skin } from "./view/skin.js";
 import { Viewer } from "./view/viewer.js";
 
-const PREFERRED = "figure";
+document.documentElement.classList.add("arrived");
 
 /** @type {import("./store.js").Page} */
 const store = /** @type {any} */ (
@@ -50,6 +51,7 @@ const store = /** @type {any} */ (
     moving: false,
     playing: false,
     shape: null,
+    failed: null,
     keyframes: [],
     loop: false,
     beyond: 0,
@@ -67,6 +69,8 @@ const store = /** @type {any} */ (
     fine: true,
     pull: false,
     pins: [],
+    hover: null,
+    solving: null,
     scan: null,
     found: null,
     ghost: true,
@@ -107,8 +111,14 @@ new Reader(store, {
   ownScale: find("#own-scale"),
   stage: find(".stage"),
 });
-new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
+new Pins(store, viewer, new Pull(store, viewer), {
+  layer: find("#pins"),
+  threads: find("#threads"),
+  hover: find("#hover"),
+  clear: find("#clear-pins"),
+});
 new ShapeLoop(store);
+new OnScreen(store, find(".stage"));
 const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
 
@@ -128,9 +138,8 @@ store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () 
 });
 store.on(["wireframe", "normals"], () => viewer.style(store));
 
-// Diagnostics of the shape.
+// What is drawn, and how long it took.
 let timed = null;
-let told = {}; // diagnostics of the last full shape
 viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
   if (!shape || shape === timed) return;
@@ -140,17 +149,6 @@ viewer.canvas.addEventListener("drawn", () => {
   find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
   Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
-store.on(["shape", "usual"], () => {
-  if (store.shape?.diagnostics) told = store.shape.diagnostics;
-  const words = inWords(told, store.usual);
-  const { how, line } = inShort(words);
-  find("#diagnostics").className = how;
-  find("#diagnostics summary").textContent = line;
-  find("#diagnostics ul").replaceChildren(
-    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })),
-  );
-});
-
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => {
@@ -191,11 +189,15 @@ const take = (code) => {
   store.set({ code: space.wrapAll(code).map((value, k) => (locked[k] ? store.code[k] : value)) });
 };
 const seed = find("#seed");
+const distribution = find("#distribution");
 seed.value = here.kept("seed") ?? 0;
+distribution.value = here.kept("distribution") ?? "population";
 const draw = reporting(async () => {
   here.keep("seed", seed.value);
-  take(await api.sample(store.model, Number(seed.value)));
+  here.keep("distribution", distribution.value);
+  take(await api.sample(store.model, Number(seed.value), distribution.value));
 });
+distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {
   seed.value = Number(seed.value) + 1;
   draw();
@@ -253,11 +255,13 @@ function goTo({ code, keyframes, locked, view, pins, state }) {
  */
 async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
   const space = new LatentSpace(model);
+  const wrapped = space.wrapAll(code ?? space.home);
+  if (store.model) api.ask(model, wrapped); // the first model's answers are under way
   opening = model;
   const coarse = await api.reference(model, "coarse");
   if (opening !== model) return;
   picker.value = model.name;
-  store.set({ shape: null, playing: false, placement: null, pins: [] });
+  store.set({ shape: null, playing: false, placement: null, pins: [], hover: null });
   viewer.open(coarse);
   pictures.open(coarse);
   if (view) Object.assign(viewer, { view, turned: true });
@@ -271,7 +275,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     regions: null,
     usual: null,
     highlight: null,
-    code: space.wrapAll(code ?? space.home),
+    code: wrapped,
     locked: locked ?? space.home.map(() => false),
     keyframes,
     against: -1,
@@ -359,7 +363,7 @@ async function restore() {
   if (!asked.code && !embedded) welcome.open();
   if (asked.model && asked.model === store.model) return goTo(asked);
   if (asked.model) return openModel(asked);
-  const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
+  const model = preferred(models);
   if (asked.missing) {
     const instead =
       `The address asks for the model ${asked.missing}, which is not served here. ` +
@@ -375,7 +379,7 @@ find("#key form").addEventListener("submit", () => {
 });
 
 try {
-  models = await api.models();
+  models = await listed;
   picker.replaceChildren(
     ...models.map(({ name, title }) => element("option", { value: name, textContent: title })),
   );
@@ -383,6 +387,7 @@ try {
     throw new Error("No model is served. Put a bundle into the models folder and start again.");
   await restore();
 } catch (error) {
+  find(".stage").ariaBusy = "false";
   if (error.status === 401) find("#key").showModal();
   else report(error);
 }

@@ -8,7 +8,7 @@
  * @property {Float32Array} positions 3V numbers
  * @property {import("three").Matrix4 | null} placement motion by a pull
  * @property {import("three").Matrix4} motion from the server's position to the shown one
- * @property {object | null} diagnostics of full shapes
+ * @property {object | null} diagnostics null for frames of a path
  * @property {"draft" | "full"} [quality]
  * @property {number} began time of the request
  *
@@ -25,6 +25,7 @@
  * @property {boolean} moving whether the user moves something; all changes meanwhile are one step
  * @property {boolean} playing
  * @property {Shape | null} shape
+ * @property {number[] | null} failed the last code that has no shape
  * @property {number[][]} keyframes
  * @property {boolean} loop
  * @property {number} beyond share of the path that is played before its start and after its end
@@ -42,6 +43,8 @@
  * @property {boolean} fine
  * @property {boolean} pull
  * @property {import("./shape/pull.js").Pin[]} pins
+ * @property {number | null} hover the vertex that a press would pull
+ * @property {number | null} solving the vertex of the pin that the server is moving
  * @property {any} scan
  * @property {{code: number[], covariance: number[][]} | null} found the shape of a file
  * @property {boolean} ghost

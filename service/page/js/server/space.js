@@ -88,3 +88,9 @@ export const sameCode = (a, b) =>
 /** Return the locked coordinates of a code as the server's `fixed`. */
 export const fixedBy = (locked, code) =>
   Object.fromEntries(code.map((value, k) => [k, value]).filter(([k]) => locked[k]));
+
+/** Return the code of `m` numbers that a text lists, or null. */
+export function codeIn(text, m) {
+  const code = (text ?? "").split(",").map(Number);
+  return code.length === m && code.every(Number.isFinite) ? code : null;
+}

@@ -90,6 +90,8 @@ export class Sliders {
     const percent = (value) => `${(100 * (value - low)) / (high - low)}%`;
 
     Object.assign(slider, { min: low, max: high, id: `z${k}` });
+    Object.assign(find(".bound", root), { id: `bound${k}` });
+    box.setAttribute("aria-describedby", `bound${k}`);
     slider.style.setProperty("--low", percent(space.lower[k]));
     slider.style.setProperty("--high", percent(space.upper[k]));
     slider.style.setProperty("--home", percent(space.home[k]));
@@ -100,10 +102,8 @@ export class Sliders {
     this.hand.on(slider);
     slider.addEventListener("input", () => this.#set(k, Number(slider.value)));
     slider.addEventListener("keydown", (event) => this.#wrapAtTheEnd(event, k, slider));
-    box.addEventListener("input", () => {
-      if (box.value !== "") this.#set(k, Number(box.value));
-    });
-    box.addEventListener("change", () => this.#show());
+    box.addEventListener("input", () => this.#typed(k, box, false));
+    box.addEventListener("change", () => this.#typed(k, box, true));
     reset.addEventListener("click", () => this.#set(k, space.home[k]));
     lock.addEventListener("click", () => {
       this.store.set({ locked: this.store.locked.map((is, i) => (i === k ? !is : is)) });
@@ -121,7 +121,30 @@ export class Sliders {
   }
 
   #set(k, value) {
+    this.#warn(k, false);
     this.#change(this.store.code.map((old, i) => (i === k ? this.store.space.wrap(k, value) : old)));
+  }
+
+  /**
+   * Take a number that the user types. A number beyond the slider is refused with its bound, because it may be
+   * the beginning of another; when the user has finished it, the bound takes its place.
+   */
+  #typed(k, box, finished) {
+    const { space } = this.store;
+    const value = box.valueAsNumber;
+    if (Number.isNaN(value)) return finished && this.#show(); // incomplete
+    const [low, high] = space.range(k).map((end) => Number(end.toFixed(4)));
+    const end = Math.min(Math.max(value, low), high);
+    const beyond = end !== value && !space.period[k];
+    if (!beyond || finished) this.#set(k, beyond ? end : value);
+    this.#warn(k, beyond && `The ${value < low ? "smallest" : "largest"} value here is ${readable(end, 4)}.`);
+    box.setAttribute("aria-invalid", String(beyond && !finished));
+    if (finished) this.#show();
+  }
+
+  /** Show a sentence about a coordinate below its field; false removes it. */
+  #warn(k, text) {
+    find(".bound", this.#rows[k].root).textContent = text || "";
   }
 
   /** Set a code, except locked coordinates. */
@@ -143,8 +166,10 @@ export class Sliders {
     if (!code || code.length !== this.#rows.length) return;
     this.#rows.forEach(({ root, slider, box, lock, controls }, k) => {
       if (Number(slider.value) !== code[k]) slider.value = code[k];
-      if (document.activeElement !== box || Number(box.value) !== code[k])
+      if (document.activeElement !== box || (Number(box.value) !== code[k] && box.ariaInvalid !== "true")) {
         box.value = Number(code[k].toFixed(4));
+        box.ariaInvalid = "false";
+      }
       root.classList.toggle("outside", !space.inside(k, code[k]));
       root.classList.toggle("locked", locked[k]);
       lock.setAttribute("aria-pressed", String(locked[k]));

@@ -35,11 +35,12 @@ const distanceOf = (camera, { radius }) =>
   radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
 
 /**
- * Return the distance at which positions (3V numbers) fit the width and a share of the height of the view.
+ * Return the distance at which positions (3V numbers) fit the width and a share of the height of the view,
+ * for a camera in a direction from the centre.
  */
-export function distanceTo(camera, positions, center, share) {
+export function distanceTo(camera, positions, center, share, direction = VIEW) {
   const back = new THREE.Quaternion()
-    .setFromRotationMatrix(new THREE.Matrix4().lookAt(VIEW, new THREE.Vector3(), camera.up))
+    .setFromRotationMatrix(new THREE.Matrix4().lookAt(direction, new THREE.Vector3(), camera.up))
     .invert();
   const high = slope(camera) * share;
   const wide = slope(camera) * camera.aspect;

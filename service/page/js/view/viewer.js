@@ -18,9 +18,11 @@ import {
   sphereOf,
   surfaceMaterial,
 } from "./scene.js";
+import { Picker } from "./picker.js";
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
+const LOWEST = Math.PI / 2; // angle of the camera from the vertical: never below the ground
 const ROOM = 1.08; // factor of the distance, for shapes that are larger than the reference
 
 export class Viewer {
@@ -38,6 +40,8 @@ export class Viewer {
     this.camera = litCamera();
     this.scene.add(this.camera);
     this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.zoomToCursor = true;
+    this.controls.maxPolarAngle = LOWEST;
     this.controls.addEventListener("change", () => this.draw());
     this.controls.addEventListener("end", () => this.#turned());
     /** Whether the view differs from the initial one. */
@@ -64,6 +68,7 @@ export class Viewer {
       polygonOffsetFactor: 1,
       polygonOffsetUnits: 1,
     });
+    this.picker = new Picker(canvas, this.camera, this.mesh);
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty, because three.js would choose flat shading without normals, and keep it.
     this.mesh.visible = this.wires.visible = false;
@@ -78,6 +83,7 @@ export class Viewer {
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
     this.#resize();
     canvas.addEventListener("keydown", (event) => this.#key(event));
+    canvas.addEventListener("dblclick", () => this.focus());
     canvas.addEventListener("webglcontextrestored", () => this.draw());
   }
 
@@ -182,6 +188,20 @@ export class Viewer {
     this.draw();
   }
 
+  /** Fill the view with the shape, from the direction of the view. */
+  focus() {
+    if (!this.mesh.geometry.index) return; // no shape is shown yet
+    const { positions } = this.picker;
+    const middle = sphereOf(positions).center;
+    const back = this.camera.position.clone().sub(this.controls.target).normalize();
+    const distance = ROOM * distanceTo(this.camera, positions, middle, this.#share, back);
+    this.controls.target.copy(middle);
+    this.camera.position.copy(middle).addScaledVector(back, distance);
+    this.controls.update();
+    this.draw();
+    this.#turned();
+  }
+
   /**
    * Show positions (3V numbers) beside the reference in the view; null shows the reference alone. The
    * direction of the view stays; the camera's position stays, too, if it is `given`.
@@ -259,44 +279,6 @@ export class Viewer {
     }
   }
 
-  /** Return the vertex nearest to the surface under a point of the window, or null. */
-  pick({ clientX, clientY }) {
-    const box = this.canvas.getBoundingClientRect();
-    const point = new THREE.Vector2(
-      ((clientX - box.left) / box.width) * 2 - 1,
-      1 - ((clientY - box.top) / box.height) * 2,
-    );
-    const caster = new THREE.Raycaster();
-    caster.setFromCamera(point, this.camera);
-    const hit = caster.intersectObject(this.mesh)[0];
-    if (!hit) return null;
-    const { geometry, matrixWorld } = this.mesh;
-    const at = (vertex) =>
-      new THREE.Vector3().fromBufferAttribute(geometry.attributes.position, vertex).applyMatrix4(matrixWorld);
-    const corners = [hit.face.a, hit.face.b, hit.face.c];
-    const vertex = corners.reduce((a, b) =>
-      at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b,
-    );
-    return { vertex, position: at(vertex) };
-  }
-
-  /** Return the position of a point in the picture, in pixels from the upper left. */
-  project(position) {
-    const { x, y } = position.clone().project(this.camera);
-    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight };
-  }
-
-  /** Return the point at a place of the window, at the depth of `depth`. */
-  unproject({ clientX, clientY }, depth) {
-    const box = this.canvas.getBoundingClientRect();
-    const { z } = depth.clone().project(this.camera);
-    return new THREE.Vector3(
-      ((clientX - box.left) / box.width) * 2 - 1,
-      1 - ((clientY - box.top) / box.height) * 2,
-      z,
-    ).unproject(this.camera);
-  }
-
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;
@@ -319,6 +301,7 @@ export class Viewer {
       const spherical = new THREE.Spherical().setFromVector3(offset);
       spherical.theta += TURN * turns[event.key][0];
       spherical.phi += TURN * turns[event.key][1];
+      spherical.phi = Math.min(spherical.phi, LOWEST);
       offset.setFromSpherical(spherical.makeSafe());
     } else if (event.key in zooms) {
       offset.multiplyScalar(zooms[event.key]);
