@@ -165,7 +165,7 @@ def test_legend_and_diagnostics_lie_apart(window: Open, width: int, height: int)
                 b["y"] + b["height"] <= a["y"] + 1,
             )
             assert any(apart), boxes
-    studio["#reset-all"].scroll_into_view_if_needed()
+    studio["#name"].scroll_into_view_if_needed()
     assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 

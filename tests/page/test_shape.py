@@ -216,8 +216,8 @@ def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) 
 
 def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     studio = window().open("#model=figure")
-    every = studio[".pictures canvas"].count()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
+    every = studio[".end canvas"].count()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == every)
     held: list[Route] = []
     studio.page.route(
         "**/vertices*",
@@ -248,9 +248,9 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
 
     studio.page.route("**/vertices*", off)
     studio.open()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
     chip = studio["#diagnostics summary"]
-    assert chip.inner_text() == "Fits, inside, usual", "all shapes of this model have as large a residual"
+    assert chip.inner_text() == "Looks right", "all shapes of this model have as large a residual"
     assert studio["#diagnostics"].get_attribute("class") == "good"
     assert studio["#found"].is_hidden()
     chip.click()
@@ -377,22 +377,22 @@ def test_the_fine_shape_lies_where_the_coarse_one_does(window: Open) -> None:
 
 def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window: Open) -> None:
     studio = window().open("#model=figure")
-    every = studio[".pictures canvas"].count()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
+    every = studio[".end canvas"].count()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == every)
 
     def blue(picture: np.ndarray) -> np.ndarray:
         return (picture[..., 2] - picture[..., 0]) > 50
 
     # Folded factors show a picture of the part of the shape that they change.
     folds = studio[".factor details"]
-    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] + [False] * (folds.count() - 1)
+    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] * 2 + [False] * (folds.count() - 2)
     pictures = [body(canvas) for canvas in studio[".factor summary canvas"].all()]
     for picture in pictures:
         assert 0.01 < (blue(picture) & (picture[..., 3] > 0)).mean() < 0.5
     # No two pictures are alike; pictures of the whole shape nearly would be.
     assert all(np.abs(a - b).mean() > 5 for i, a in enumerate(pictures) for b in pictures[:i])
-    studio[".factor summary"].nth(1).click()
-    assert studio["#z2"].is_visible()
+    studio[".factor summary"].nth(2).click()
+    assert studio["#z4"].is_visible()
 
     studio["#canvas"].hover()
     studio.eventually(lambda: not blue(studio.picture()).any())
@@ -413,11 +413,11 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
 
 
 def test_pictures_of_each_coordinate(studio: OpenPage) -> None:
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
-    less, mean, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(3))
-    covered = [(picture[..., 3] > 0).mean() for picture in (less, mean, more)]
-    assert covered[0] < covered[1] < covered[2], "this coordinate scales the shape"
-    studio.coordinate(0).locator(".pictures button").nth(2).click()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
+    less, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(2))
+    covered = [(picture[..., 3] > 0).mean() for picture in (less, more)]
+    assert covered[0] < covered[1], "this coordinate scales the shape"
+    studio.coordinate(0).locator(".end").nth(1).click()
     studio.until_code([0.2, 0, 0])
 
 

@@ -6,6 +6,8 @@ import { OTHER } from "./view/colouring.js";
 
 const COLOURS = ["stretch", "bending", "distance"];
 const FLAGS = ["wireframe", "normals", "loop"];
+const MATERIALS = ["own", "clay", "skin", "metal", "matcap"];
+const LIGHTS = ["studio", "soft", "side"];
 const number = (value) => String(Number(value.toFixed(5)));
 const list = (numbers) => numbers.map(number).join(",");
 const unlist = (text) => text.split(",").map(Number);
@@ -15,6 +17,7 @@ export function toHash(store, view) {
   const parts = new URLSearchParams({ model: store.model.name, z: list(store.code) });
   const flags = FLAGS.filter((flag) => store[flag]);
   if (!store.fine) flags.push("coarse");
+  if (!store.ground) flags.push("bare");
   if (flags.length) parts.set("show", flags.join(","));
   if (store.locked.some(Boolean))
     parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
@@ -23,6 +26,8 @@ export function toHash(store, view) {
   if (store.seconds) parts.set("seconds", number(store.seconds));
   if (store.easing !== "even") parts.set("easing", store.easing);
   if (COLOURS.includes(store.colour)) parts.set("colour", store.colour);
+  if (store.material !== "own" || store.light !== "studio")
+    parts.set("look", `${store.material},${store.light}`);
   if (store.other) parts.set("other", list(store.other));
   if (store.against !== -1) parts.set("against", store.against);
   if (store.pins.length) parts.set("pins", store.pins.map(fromPin).join(";"));
@@ -80,6 +85,7 @@ export function fromHash(hash, models) {
   const beyond = Number(parts.get("beyond"));
   const seconds = Number(parts.get("seconds"));
   const colour = parts.get("colour");
+  const [material, light] = (parts.get("look") ?? "").split(",");
   return {
     model,
     code: codeIn(parts.get("z"), m),
@@ -91,6 +97,9 @@ export function fromHash(hash, models) {
       placement: toPlacement(unlist(parts.get("place") ?? "")),
       ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
       fine: !flags.includes("coarse"),
+      ground: !flags.includes("bare"),
+      material: MATERIALS.includes(material) ? material : "own",
+      light: LIGHTS.includes(light) ? light : "studio",
       colour: COLOURS.includes(colour) ? colour : "none",
       against: isThere ? Math.max(against, OTHER) : -1,
       other,

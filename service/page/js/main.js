@@ -6,8 +6,10 @@ import { Hand } from "./hand.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
+import { sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { tabs } from "./tabs.js";
+import { theme } from "./theme.js";
 import { Path } from "./path/path.js";
 import { Strip } from "./path/strip.js";
 import { Ghost } from "./scan/ghost.js";
@@ -28,6 +30,7 @@ import { Shelf } from "./shelf/shelf.js";
 import { copy, Files } from "./show/files.js";
 import { Welcome } from "./show/welcome.js";
 import { Colouring } from "./view/colouring.js";
+import { Look } from "./view/look.js";
 import { Modes } from "./view/modes.js";
 import { Pictures } from "./view/pictures.js";
 import { Pose } from "./view/pose.js";
@@ -64,6 +67,11 @@ const store = /** @type {any} */ (
     highlight: null,
     regions: null,
     repaint: null,
+    motions: null,
+    material: "own",
+    hasOwn: false,
+    light: "studio",
+    ground: true,
     wireframe: false,
     normals: false,
     fine: true,
@@ -121,6 +129,8 @@ new ShapeLoop(store);
 new OnScreen(store, find(".stage"));
 const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
+sheet(find("#sheet"), find("main"));
+new Look(store, viewer, find(".stage"));
 
 // The shape and its colours.
 store.on(["shape"], () => {
@@ -133,15 +143,16 @@ store.on(["shape"], () => {
     placement ? placement.clone().multiply(motion) : motion,
   );
 });
-store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
+store.on(["wireframe", "normals", "material", "colour"], () => viewer.style(store));
+store.on(["colour", "against", "highlight", "regions", "repaint", "material"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
 });
-store.on(["wireframe", "normals"], () => viewer.style(store));
 
 // What is drawn, and how long it took.
 let timed = null;
 viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
+  find("#reset-view").hidden = !viewer.turned;
   if (!shape || shape === timed) return;
   timed = shape;
   const took = performance.now() - shape.began;
@@ -153,6 +164,7 @@ viewer.canvas.addEventListener("drawn", () => {
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => {
   viewer.resetView();
+  viewer.canvas.focus(); // the button goes
   remember();
 });
 /** @type {NodeListOf<any>} */
@@ -169,19 +181,7 @@ store.on(["found", "code"], () => {
   find("#sure").hidden = !isShown;
   if (!isShown && colour === "spread") store.set({ colour: "none" });
 });
-const root = document.documentElement;
-const theme = always.kept("theme");
-if (theme) root.dataset.theme = theme;
-viewer.recolour();
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => viewer.recolour());
-find("#theme").addEventListener("click", () => {
-  const dark = root.dataset.theme
-    ? root.dataset.theme === "dark"
-    : matchMedia("(prefers-color-scheme: dark)").matches;
-  root.dataset.theme = dark ? "light" : "dark";
-  always.keep("theme", root.dataset.theme);
-  viewer.recolour();
-});
+theme(find("#theme"), viewer);
 
 // Codes that do not come from the sliders.
 const take = (code) => {
@@ -205,7 +205,6 @@ find("#random").addEventListener("click", () => {
 seed.addEventListener("change", () => {
   if (seed.validity.valid && seed.value !== "") draw();
 });
-find("#reset-all").addEventListener("click", () => take(store.space.home));
 find("#draw-strip").addEventListener(
   "click",
   reporting(() => strip.draw()),
@@ -269,6 +268,8 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     model,
     space,
     names: namesOf(model),
+    motions: null,
+    hasOwn: false,
     references: { coarse },
     hasFine: false,
     pose: null,
@@ -302,7 +303,10 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     try {
       const skin = await Skin.of(await api.textured(model));
       if (store.model !== model) skin.dispose();
-      else viewer.dress(store.hasFine ? "fine" : "coarse", skin);
+      else {
+        viewer.dress(store.hasFine ? "fine" : "coarse", skin);
+        store.set({ hasOwn: true });
+      }
     } catch (error) {
       // only the appearance is missing without it
       report(error);
@@ -346,6 +350,9 @@ store.on(
     "other",
     "wireframe",
     "normals",
+    "material",
+    "light",
+    "ground",
     "fine",
     "moving",
     "playing",

@@ -15,7 +15,8 @@
  * @typedef {object} State
  * @property {any} model as the server lists it
  * @property {import("./server/space.js").LatentSpace | null} space
- * @property {{factors: string[], labels: string[], coordinates: string[]} | null} names
+ * @property {Names | null} names
+ * @property {import("./shape/motions.js").Motion[] | null} motions by coordinate, once they are computed
  * @property {{coarse?: Reference, fine?: Reference}} references
  * @property {boolean} hasFine
  * @property {import("./view/pose.js").Pose | null} pose if there is a fine mesh
@@ -38,6 +39,10 @@
  * @property {number | null} highlight index of the factor under the pointer
  * @property {Float32Array[] | null} regions weights of each factor at coarse vertices
  * @property {object | null} repaint a new object when colours must be computed again
+ * @property {string} material "clay", "skin", "metal", "matcap" or "own"
+ * @property {boolean} hasOwn whether the file's own material is there
+ * @property {string} light "studio", "soft" or "side"
+ * @property {boolean} ground
  * @property {boolean} wireframe
  * @property {boolean} normals
  * @property {boolean} fine
@@ -48,6 +53,12 @@
  * @property {any} scan
  * @property {{code: number[], covariance: number[][]} | null} found the shape of a file
  * @property {boolean} ghost
+ *
+ * @typedef {object} Names
+ * @property {string[]} factors
+ * @property {string[]} labels of coordinates, shown below the factor's name
+ * @property {string[]} coordinates full names
+ * @property {import("./shape/motions.js").Motion[]} ends by coordinate, null where it has a name
  *
  * @typedef {{vertices: Float32Array, faces: Int32Array}} Reference
  * @typedef {Store & State} Page the store that all parts of the page use

@@ -7,6 +7,7 @@ import * as api from "../server/api.js";
 import { tint } from "./colours.js";
 import { percentile } from "../dom.js";
 import { report } from "../messages.js";
+import { keepMotions, motionsOf } from "../shape/motions.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
@@ -26,7 +27,7 @@ export class Modes {
     });
   }
 
-  /** Draw the pictures of every coordinate; each has the home shape in the middle. */
+  /** Draw the pictures of every coordinate, and name its motion. */
   async draw() {
     const {
       model,
@@ -42,10 +43,11 @@ export class Modes {
       } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
       const residuals = [];
+      const ends = [];
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
-          const [down, , up] = space.stations(k);
+          const [down, up] = space.ends(k);
           changes.push({ [k]: down }, { [k]: up });
         }
         const codes = changes.map((change) => space.homeBut(change));
@@ -53,7 +55,8 @@ export class Modes {
         residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
-          this.#draw(k, [down, home, up]);
+          ends[k] = [down, up];
+          this.#draw(k, ends[k]);
           this.#grow(j, surface, rest, [down, up]);
         }
         this.#regions[j] = smooth(this.#regions[j]);
@@ -64,7 +67,9 @@ export class Modes {
           around(home, this.#regions[j]),
         );
       }
-      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5) });
+      const motions = motionsOf(model.factors, home, ends);
+      keepMotions(model, motions);
+      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5), motions });
     } catch (error) {
       report(error);
     }

@@ -6,22 +6,13 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
-import {
-  distanceTo,
-  face,
-  frame,
-  geometryOf,
-  litCamera,
-  move,
-  paint,
-  sideOf,
-  sphereOf,
-  surfaceMaterial,
-} from "./scene.js";
+import { distanceTo, face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf } from "./scene.js";
+import { colourOf, materials } from "./look.js";
 import { Picker } from "./picker.js";
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
+const SPEED = 4; // of a view that turns by itself: 15 s a turn
 const LOWEST = Math.PI / 2; // angle of the camera from the vertical: never below the ground
 const ROOM = 1.08; // factor of the distance, for shapes that are larger than the reference
 
@@ -47,9 +38,19 @@ export class Viewer {
     /** Whether the view differs from the initial one. */
     this.turned = false;
 
-    this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
+    this.material = materials(this.renderer);
+    this.normals = new THREE.MeshNormalMaterial({
+      polygonOffset: true, // as the other materials, see below
+      polygonOffsetFactor: 1,
+      polygonOffsetUnits: 1,
+    });
+    /** @type {THREE.Side} */
+    this.side = THREE.FrontSide;
+    this.worn = "clay";
+    /** A second shape in the same material, if there is one. @type {THREE.Mesh | null} */
+    this.companion = null;
     /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
-    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
+    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.surface);
     const wires = new THREE.MeshBasicMaterial({
       wireframe: true,
       color: 0x1f2a37,
@@ -58,16 +59,6 @@ export class Viewer {
     });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
     // Lines lie on the surface; slightly nearer to the camera, they don't flicker.
-    Object.assign(this.materials.surface, {
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
-    });
-    Object.assign(this.materials.normals, {
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
-    });
     this.picker = new Picker(canvas, this.camera, this.mesh);
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty, because three.js would choose flat shading without normals, and keep it.
@@ -100,7 +91,8 @@ export class Viewer {
     this.middle = this.sphere.center;
     this.stage.open(this.sphere);
     this.side = sideOf(reference.faces, reference.vertices.length / 3);
-    for (const material of Object.values(this.materials)) face(material, this.side);
+    face(this.normals, this.side);
+    face(this.surface, this.side);
     this.resetView();
   }
 
@@ -122,7 +114,7 @@ export class Viewer {
     const { skin, mesh } = this;
     if (!mesh.geometry.index) return; // no shape is shown yet
     const wears = Boolean(skin) && mesh.geometry === this.geometries[this.skinOf];
-    this.skinned.visible = wears && !this.coloured && mesh.material === this.materials.surface;
+    this.skinned.visible = wears && this.own && !this.coloured && mesh.material !== this.normals;
     mesh.visible = !this.skinned.visible;
     if (wears) skin.follow(mesh.geometry);
   }
@@ -131,7 +123,7 @@ export class Viewer {
   show(name, positions, colours, placement) {
     const geometry = this.geometries[name];
     move(geometry, positions);
-    paint(geometry, colours);
+    paint(geometry, colours, this.base);
     this.mesh.geometry = this.wires.geometry = geometry;
     for (const mesh of [this.mesh, this.wires, this.skinned]) {
       mesh.matrixAutoUpdate = false;
@@ -145,18 +137,58 @@ export class Viewer {
   }
 
   paint(colours) {
-    paint(this.mesh.geometry, colours);
+    paint(this.mesh.geometry, colours, this.base);
     this.coloured = Boolean(colours);
     this.#wear();
     this.draw();
   }
 
-  /** Set whether lines are shown, and whether colours show normals. */
-  style({ wireframe, normals }) {
+  /** The material of the surface, drawn on the sides that the model needs. */
+  get surface() {
+    const material = this.material(this.worn);
+    return material.side === this.side ? material : face(material, this.side);
+  }
+
+  /** The colour of the surface where it has no other. */
+  get base() {
+    return colourOf(this.worn);
+  }
+
+  /** Set the material, whether lines are shown, and whether colours show normals. */
+  style({ wireframe, normals, material, colour }) {
     this.wires.visible = wireframe;
-    this.mesh.material = normals ? this.materials.normals : this.materials.surface;
+    this.own = material === "own";
+    this.worn = colour === "none" ? material : "clay"; // colours are read on a matt surface
+    this.mesh.material = normals ? this.normals : this.surface;
+    if (this.companion) this.cover(this.companion);
     this.#wear();
     this.draw();
+  }
+
+  /** Give a second shape the surface of the first. */
+  cover(mesh) {
+    this.companion = mesh;
+    mesh.material = this.surface;
+    if (mesh.geometry.attributes.color) paint(mesh.geometry, null, this.base);
+  }
+
+  /** Whether the view turns by itself. */
+  get spins() {
+    return this.controls.autoRotate;
+  }
+
+  /** Start or stop to turn by itself. */
+  spin(on) {
+    if (this.spins && !on) this.#turned();
+    Object.assign(this.controls, { autoRotate: on, autoRotateSpeed: SPEED });
+    let before = performance.now();
+    const step = (now) => {
+      if (!this.spins) return;
+      this.controls.update(Math.max(now - before, 0) / 1000);
+      before = now;
+      requestAnimationFrame(step);
+    };
+    if (on) requestAnimationFrame(step);
   }
 
   /** Add a ground below a shape. */
