@@ -19,6 +19,7 @@ import { listed, preferred } from "./server/first.js";
 import { ShapeLoop } from "./server/shape-loop.js";
 import { LatentSpace, sameCode } from "./server/space.js";
 import { openCard } from "./shape/card.js";
+import { keptMotions } from "./shape/motions.js";
 import { Names, namesOf } from "./shape/names.js";
 import { OnScreen } from "./shape/on-screen.js";
 import { Pins } from "./shape/pins.js";
@@ -268,7 +269,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     model,
     space,
     names: namesOf(model),
-    motions: null,
+    motions: keptMotions(model),
     hasOwn: false,
     references: { coarse },
     hasFine: false,

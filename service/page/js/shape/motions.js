@@ -26,20 +26,18 @@ export function keptMotions(model) {
 export const keepMotions = (model, motions) => always.keep(place(model), JSON.stringify(motions));
 
 /**
- * Name the coordinates of all factors.
+ * Name the coordinates of factors.
  * @param {{name: string, start: number, stop: number}[]} factors
- * @param {Float32Array} home positions (3V numbers) of the home shape
- * @param {Float32Array[][]} ends positions at both ends of each coordinate
+ * @param {ReturnType<typeof measure>[]} seen by coordinate
  * @returns {Motion[]}
  */
-export function motionsOf(factors, home, ends) {
-  const seen = ends.map(([down, up]) => measure(home, down, up));
-  const [middle, width] = across(home);
-  const aside = seen.map(({ center }) => (center[0] - middle) / width);
+export function motionsOf(factors, seen) {
+  const aside = seen.map((each) => each.aside);
   // A body's own sides, as its factors are named; otherwise sides of the picture.
   const left = factors.find(({ name, start }) => /\bleft\b/i.test(name) && Math.abs(aside[start]) > ASIDE);
+  /** @type {[string, string]} */
   const sides = (left ? aside[left.start] : -1) > 0 ? ["right", "left"] : ["left", "right"];
-  const motions = ends.map(() => null);
+  const motions = seen.map(() => null);
   for (const { start, stop } of factors) {
     // The clearest motion first; within a factor each motion occurs once.
     const taken = new Set();
@@ -80,8 +78,14 @@ function wordsFor(kind, [minus, plus], aside) {
   return words[kind];
 }
 
-/** Return the part that moves most, and how much of its displacement each kind of motion explains. */
-function measure(home, down, up) {
+/**
+ * Measure how much of the displacement of the part that moves most each kind of motion explains, and how far
+ * this part lies from the middle, in widths.
+ * @param {Float32Array} home positions (3V numbers) of the home shape
+ * @param {Float32Array} down positions at the lower end of a coordinate
+ * @param {Float32Array} up positions at its upper end
+ */
+export function measure(home, down, up) {
   const moves = againstRest(
     home,
     up.map((x, i) => x - down[i]),
@@ -108,7 +112,8 @@ function measure(home, down, up) {
   const all = stretch[0] + stretch[1] + stretch[2];
   // Growth along one axis is named by the axis.
   scores.grow = Math.max(...stretch.map(Math.abs)) > 0.7 * Math.abs(all) ? 0 : all;
-  return { center, scores };
+  const [middle, width] = across(home);
+  return { aside: (center[0] - middle) / width, scores };
 }
 
 /**

@@ -7,7 +7,7 @@ import * as api from "../server/api.js";
 import { tint } from "./colours.js";
 import { percentile } from "../dom.js";
 import { report } from "../messages.js";
-import { keepMotions, motionsOf } from "../shape/motions.js";
+import { keepMotions, measure, motionsOf } from "../shape/motions.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
@@ -43,7 +43,8 @@ export class Modes {
       } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
       const residuals = [];
-      const ends = [];
+      const seen = []; // measures of motions, by coordinate
+      const isKnown = Boolean(this.store.motions);
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
@@ -55,10 +56,11 @@ export class Modes {
         residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
-          ends[k] = [down, up];
-          this.#draw(k, ends[k]);
+          this.#draw(k, [down, up]);
+          seen[k] = measure(home, down, up);
           this.#grow(j, surface, rest, [down, up]);
         }
+        if (!isKnown) this.store.set({ motions: motionsOf(model.factors.slice(0, j + 1), seen) });
         this.#regions[j] = smooth(this.#regions[j]);
         this.pictures.draw(
           this.sliders.picture(j),
@@ -67,7 +69,7 @@ export class Modes {
           around(home, this.#regions[j]),
         );
       }
-      const motions = motionsOf(model.factors, home, ends);
+      const motions = motionsOf(model.factors, seen);
       keepMotions(model, motions);
       this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5), motions });
     } catch (error) {

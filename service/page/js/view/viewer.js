@@ -6,7 +6,18 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
-import { distanceTo, face, frame, geometryOf, litCamera, move, paint, sideOf, sphereOf } from "./scene.js";
+import {
+  VIEW,
+  distanceTo,
+  face,
+  frame,
+  geometryOf,
+  litCamera,
+  move,
+  paint,
+  sideOf,
+  sphereOf,
+} from "./scene.js";
 import { colourOf, materials } from "./look.js";
 import { Picker } from "./picker.js";
 import { Stage } from "./stage.js";
@@ -14,12 +25,14 @@ import { Stage } from "./stage.js";
 const TURN = Math.PI / 24;
 const SPEED = 4; // of a view that turns by itself: 15 s a turn
 const LOWEST = Math.PI / 2; // angle of the camera from the vertical: never below the ground
+const ROOM_FOR_TWO = 1.2; // the legend, which is often shown then, hides a corner
 const ROOM = 1.08; // factor of the distance, for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
   #share = 1; // share of the height that is free for the shape
   #grounds = [];
+  #back = 0; // times by which the camera has moved back for a second shape
 
   /** `margin`: pixels of the canvas's height below buttons and text. */
   constructor(canvas, margin) {
@@ -212,6 +225,7 @@ export class Viewer {
 
   resetView() {
     this.turned = false;
+    this.#back = 0;
     frame(this.camera, { center: this.middle, radius: this.sphere.radius }, this.#distance);
     this.controls.target.copy(this.middle);
     this.controls.minDistance = 0.2 * this.sphere.radius;
@@ -245,7 +259,16 @@ export class Viewer {
     this.middle = sphereOf(this.seen).center;
     if (!this.turned) this.resetView();
     else if (!given) {
-      this.#move(this.middle.clone().sub(middle), this.#distance / before);
+      // Both shapes fit, however near the camera was; afterwards the camera returns to its distance.
+      const now = this.#distance;
+      const away = this.camera.position.distanceTo(this.controls.target);
+      const times = positions
+        ? Math.max(now / before, now / away)
+        : this.#back
+          ? 1 / this.#back
+          : now / before;
+      this.#back = positions ? (this.#back || 1) * times : 0;
+      this.#move(this.middle.clone().sub(middle), times);
       // The address may be older than the shape.
       this.canvas.dispatchEvent(new Event("turned"));
     }
@@ -262,7 +285,9 @@ export class Viewer {
 
   /** Return the distance at which the shapes fill the free part of the picture. */
   get #distance() {
-    return ROOM * distanceTo(this.camera, this.seen, this.middle, this.#share);
+    const from = this.turned ? this.camera.position.clone().sub(this.controls.target) : VIEW;
+    const room = this.seen === this.reference ? ROOM : ROOM_FOR_TWO;
+    return room * distanceTo(this.camera, this.seen, this.middle, this.#share, from);
   }
 
   /** Position and target of the camera, as six numbers. */
