@@ -19,7 +19,6 @@ import { listed, preferred } from "./server/first.js";
 import { ShapeLoop } from "./server/shape-loop.js";
 import { LatentSpace, sameCode } from "./server/space.js";
 import { openCard } from "./shape/card.js";
-import { keptMotions } from "./shape/motions.js";
 import { Names, namesOf } from "./shape/names.js";
 import { OnScreen } from "./shape/on-screen.js";
 import { Pins } from "./shape/pins.js";
@@ -269,7 +268,6 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     model,
     space,
     names: namesOf(model),
-    motions: keptMotions(model),
     hasOwn: false,
     references: { coarse },
     hasFine: false,

@@ -7,7 +7,7 @@ import * as api from "../server/api.js";
 import { tint } from "./colours.js";
 import { percentile } from "../dom.js";
 import { report } from "../messages.js";
-import { keepMotions, measure, motionsOf } from "../shape/motions.js";
+import { keepMotions, keptMotions, measure, motionsOf } from "../shape/motions.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
@@ -24,6 +24,7 @@ export class Modes {
     store.on(["model"], () => {
       this.#abort.abort();
       this.#regions = [];
+      store.set({ motions: keptMotions(store.model) });
     });
   }
 
