@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -26,17 +27,18 @@ def test_the_models_and_their_cards(studio: OpenPage) -> None:
     for fact in (
         "A torus for tests.",
         "with-fine · version 1 · CC0-1.0",
-        "composite",
-        "64",
+        "This model",
+        "64 vertices",
         "Digest",
-        "unseen shapes",
-        "3 %",
-        "5 %",
-        "a linear model with as many numbers",
-        "random shapes, to the nearest trained on",
-        "how far they stray",
+        "shapes that training has not seen",
+        "3\u00a0%",
+        "5\u00a0%",
+        "away from the nearest training shape",
+        "With as many principal components",
     ):
         assert fact in card
+    bars = studio["#card .bar"].evaluate_all("bars => bars.map((bar) => bar.getBoundingClientRect().width)")
+    assert bars[0] / bars[1] == pytest.approx(3 / 5, rel=0.02)
     studio.page.keyboard.press("Escape")
     small = studio.picture()
     studio["#model"].select_option("Figure")
@@ -44,6 +46,12 @@ def test_the_models_and_their_cards(studio: OpenPage) -> None:
     studio.until_different(small, 0.02)
     assert studio["#undo"].is_disabled()
     assert "Figure" in studio.page.title()
+    studio["#about"].click()
+    studio.eventually(lambda: "A mannequin" in studio["#card"].inner_text())
+    card = studio["#card"].inner_text()
+    assert "99.995\u00a0%" in card
+    assert "100\u00a0%" not in card, "what is nearly all is not all"
+    assert "_" not in card, "names in words"
 
 
 def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> None:
@@ -128,6 +136,9 @@ def test_a_server_with_a_key(window: Open, start: Start, models: Path) -> None:
     server = start(models, api_key="open-sesame")
     studio = window(server.url, complains=True)
     studio.page.goto(server.url)
+    studio.eventually(studio["#key"].is_visible)
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "key")
     studio["#key input"].fill("open-sesame")
     studio["#key input"].press("Enter")
     studio.rest()
@@ -160,10 +171,24 @@ def test_no_model_is_said(window: Open, start: Start, tmp_path: Path) -> None:
     studio.eventually(lambda: "No model is served" in studio.messages)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
-    studio = window(color_scheme=scheme).open()
+LOOKS: dict[str, dict[str, Any]] = {
+    "light": {},
+    "dark": {"color_scheme": "dark"},
+    "phone": {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True},
+}
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_axe_finds_no_fault(window: Open, look: str) -> None:
+    studio = window(**LOOKS[look]).open()
     studio.page.evaluate(AXE.read_text())
+    studio["#to-look"].click()
+    studio.eventually(studio["#look"].is_visible)
+    check(studio, "look")
+    studio.page.keyboard.press("Escape")
+    if look == "phone":
+        studio["#to-more"].click()
+        check(studio, "menu")
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
     check(studio, "card")
@@ -183,6 +208,10 @@ def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
         if tab == "Colour":
             studio.page.get_by_label("stretch").check()
             studio.eventually(studio["#legend"].is_visible)
+        if tab == "Files":
+            scan = httpx.get(f"{studio.url}/v1/models/with-fine/mesh?latent=0.1,0,0.5&format=obj").content
+            studio["#mesh-file"].set_input_files({"name": "a.obj", "mimeType": "model/obj", "buffer": scan})
+            studio.eventually(lambda: "code of a.obj" in studio["#verdict h2"].inner_text())
         check(studio, tab)
 
 

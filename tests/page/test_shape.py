@@ -385,7 +385,9 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
 
     # Folded factors show a picture of the part of the shape that they change.
     folds = studio[".factor details"]
-    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] * 2 + [False] * (folds.count() - 2)
+    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] * 2 + [False] * (
+        folds.count() - 2
+    )
     pictures = [body(canvas) for canvas in studio[".factor summary canvas"].all()]
     for picture in pictures:
         assert 0.01 < (blue(picture) & (picture[..., 3] > 0)).mean() < 0.5
@@ -458,7 +460,14 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     for i in range(1, 6):
         touch("touchMove", (x - 20 - 8 * i, y), (x + 20 + 8 * i, y))
     touch("touchEnd")
-    studio.until_different(turned, 0.01)
+    pinched = studio.until_different(turned, 0.01)
+    target = studio.eventually(lambda: studio.hash.get("view")).split(",")[3:]
+    touch("touchStart", (x - 20, y), (x + 20, y))
+    for i in range(1, 6):
+        touch("touchMove", (x - 20, y + 10 * i), (x + 20, y + 10 * i))
+    touch("touchEnd")
+    studio.until_different(pinched, 0.01)
+    studio.eventually(lambda: studio.hash["view"].split(",")[3:] != target)
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.scroll_into_view_if_needed()
     slider.tap(position={"x": 200, "y": 12})

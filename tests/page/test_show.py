@@ -124,6 +124,8 @@ def test_the_viewer_in_a_page_of_another_origin(
     window: Open, start: Start, models: Path, theirs: str, tmp_path: Path
 ) -> None:
     studio = window().open("#model=with-fine&z=0.1,1,0.5")
+    studio["#canvas"].press("ArrowRight")
+    view = studio.eventually(lambda: studio.hash.get("view"))
     studio.tab("Files")
     studio["#language"].select_option("a frame in a page")
     code = studio["#code"].text_content() or ""
@@ -145,7 +147,7 @@ def test_the_viewer_in_a_page_of_another_origin(
     for name in ("header", ".panel", ".tools", ".status"):
         assert frame.locator(name).is_hidden(), name
     whole = frame.locator("#whole")
-    other.eventually(lambda: (whole.get_attribute("href") or "").endswith("/#model=with-fine&z=0.1,1,0.5"))
+    other.eventually(lambda: (whole.get_attribute("href") or "").endswith(f"/#model=with-fine&z=0.1,1,0.5&view={view}"))
     picture = pixels(other.page.locator("iframe").screenshot())
     shown = np.abs(picture - picture[5, 5]).max(axis=2) > 60
     assert np.ptp(np.flatnonzero(shown[:, 10:-10].any(axis=1))) > 0.4 * len(picture)

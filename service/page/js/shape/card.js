@@ -3,7 +3,7 @@
 import * as api from "../server/api.js";
 import { almost, element, find, readable } from "../dom.js";
 
-const percent = (share) => `${readable(100 * share)} %`;
+const percent = (share) => `${readable(100 * share)}\u00a0%`;
 
 /** Rows of the table, named as in a run's report; the card as JSON has figures without a name here. */
 const ROWS = {
@@ -25,7 +25,7 @@ function sentences(card) {
     `A code has ${m} ${m === 1 ? "number" : "numbers"} in ${parts}. Each shape has ${vertices} vertices and ` +
       `${faces} faces.`,
     r2?.composite &&
-      `On test shapes, the networks explain ${almost(r2.composite.total)} % of the variance of lengths and ` +
+      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of lengths and ` +
         "angles.",
     error?.mean &&
       `Their vertices are off by ${percent(error.mean)} of the shape’s diagonal on average, compared with ` +
@@ -71,7 +71,8 @@ export async function openCard(dialog, model) {
     );
   }
   const rows = Object.entries(figures.r2 ?? {}).filter(([name]) => name in ROWS);
-  const cell = (value) => element("td", { textContent: value === undefined ? "" : `${almost(value)} %` });
+  const cell = (value) =>
+    element("td", { textContent: value === undefined ? "" : `${almost(value)}\u00a0%` });
   find(".compared tbody", dialog).replaceChildren(
     ...rows.map(([name, { total, lengths, angles }]) =>
       element(

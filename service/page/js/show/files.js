@@ -48,6 +48,7 @@ export class Files {
     store.on(["code", "model", "fine", "colour", "against", "keyframes", "other", "placement"], () =>
       this.#tell(),
     );
+    viewer.canvas.addEventListener("turned", () => this.#tell());
     this.format.addEventListener("change", () => this.#tell());
     find("#download", root).addEventListener(
       "click",
@@ -96,7 +97,8 @@ export class Files {
     const {
       model: { name, title },
     } = this.store;
-    const embed = `${api.origin}/?embed${toHash(this.store, null)}`;
+    const view = this.viewer.turned ? this.viewer.view : null;
+    const embed = `${api.origin}/?embed${toHash(this.store, view)}`;
     const file = `${name}.${this.format.value}`;
     this.code.textContent = CODE[this.language.value]({ url: api.origin + path, body, file, embed, title });
   }
