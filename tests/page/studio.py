@@ -11,10 +11,24 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import ConsoleMessage, Locator, Page, Request
+from playwright.sync_api import ConsoleMessage, Locator, Page, Request, Route
 
 T = TypeVar("T")
 PATIENCE = 120.0  # seconds; the machine may be busy with other things
+
+
+class Hold:
+    """Holds the requests to addresses that match a pattern, until `release`; `routes` has those that are held."""
+
+    def __init__(self, page: Page, address: str) -> None:
+        self.routes: list[Route] = []
+        self._released = False
+        page.route(address, lambda route: route.continue_() if self._released else self.routes.append(route))
+
+    def release(self) -> None:
+        self._released = True
+        for route in self.routes:
+            route.continue_()
 
 
 class OpenPage:

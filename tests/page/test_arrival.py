@@ -3,22 +3,14 @@
 import re
 
 import numpy as np
-from playwright.sync_api import Route
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage
-
-
-def hold(studio: OpenPage, address: str) -> list[Route]:
-    """Hold all requests to addresses that match, and collect them."""
-    held: list[Route] = []
-    studio.page.route(address, lambda route: held.append(route) or None)
-    return held
+from tests.page.studio import Hold
 
 
 def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open) -> None:
     studio = window()
-    held = hold(studio, "**/js/view/*.js")
+    held = Hold(studio.page, "**/js/view/*.js")
     answered: list[str] = []
     studio.page.on("requestfinished", lambda request: answered.append(request.url))
     studio.page.goto(f"{studio.url}/#model=figure", wait_until="commit")
@@ -33,8 +25,7 @@ def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open
     assert np.ptp(np.flatnonzero(ink)) > 0.7 * len(drawn), "the drawing fills the stage"
     assert studio["#random"].evaluate("e => e.closest('[inert]') !== null")
     asked = list(studio.asked)
-    for route in held:
-        route.continue_()
+    held.release()
     studio.rest()
     assert studio["#poster"].is_hidden()
     assert studio["#busy"].is_hidden()

@@ -3,10 +3,10 @@
 from typing import Any
 
 import numpy as np
-from playwright.sync_api import Locator, Route
+from playwright.sync_api import Locator
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage, difference
+from tests.page.studio import Hold, OpenPage, difference
 from tests.page.test_operation import AXE, check
 
 
@@ -148,8 +148,7 @@ def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happ
     marked = studio["#hover"].bounding_box()
     assert marked
     assert np.hypot(marked["x"] + 8 - x - 15, marked["y"] + 8 - y) < 13
-    held: list[Route] = []
-    studio.page.route("**/edit*", lambda route: held.append(route) or None)
+    held = Hold(studio.page, "**/edit*")
     mouse.down()
     assert studio["#hover"].is_hidden()
     mouse.move(x + 45, y - 40)
@@ -160,9 +159,7 @@ def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happ
     assert np.hypot(ends[2] - ends[0], ends[3] - ends[1]) > 40, "a line joins the pin to the vertex, far away"
     assert "view" not in studio.hash, "a near miss does not turn the view"
     mouse.up()
-    studio.eventually(lambda: bool(held))
-    studio.page.unroute("**/edit*")
-    held[0].continue_()
+    held.release()
     studio.eventually(lambda: studio[".pin.busy"].count() == 0)
     studio.until_code(studio.eventually(lambda: studio.code if any(studio.code) else None))
 
@@ -170,12 +167,18 @@ def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happ
 def test_a_finger_pulls_and_a_second_one_does_not_turn_the_view(window: Open) -> None:
     studio = window(viewport={"width": 390, "height": 760}, has_touch=True, is_mobile=True).open("#model=figure")
     studio["#pull"].tap()
+    devtools = studio.page.context.new_cdp_session(studio.page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
     x, y = hand(studio)
-    touch(studio, "touchStart", (x + 20, y))
-    touch(studio, "touchMove", (x + 30, y - 20))
-    touch(studio, "touchStart", (x + 30, y - 20), (x - 60, y + 90))
-    touch(studio, "touchMove", (x + 30, y - 30), (x - 90, y + 60))
-    touch(studio, "touchEnd")
+    touch("touchStart", (x + 20, y))
+    touch("touchMove", (x + 30, y - 20))
+    touch("touchStart", (x + 30, y - 20), (x - 60, y + 90))
+    touch("touchMove", (x + 30, y - 30), (x - 90, y + 60))
+    touch("touchEnd")
     studio.eventually(lambda: any(studio.code))
     assert studio[".pin"].count() == 1
     studio.rest()
@@ -210,6 +213,7 @@ def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_
 
     studio.page.keyboard.press("0")
     studio.eventually(lambda: "view" not in studio.hash)
+    studio["#wireframe"].focus()  # so that the canvas has no focus ring
     x, y = hand(studio)
     mouse.move(x, y)
     for _ in range(6):
@@ -237,10 +241,3 @@ def covers(studio: OpenPage) -> bool:
     height, width = picture.shape[:2]
     inside = columns.min() > 3 and columns.max() < width - 3
     return bool(inside and np.ptp(rows) > 0.6 * height and abs(columns.mean() - width / 2) < 0.15 * width)
-
-
-def touch(studio: OpenPage, kind: str, *points: tuple[float, float]) -> None:
-    """Touch the window with fingers at some places."""
-    places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
-    devtools = studio.page.context.new_cdp_session(studio.page)
-    devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Route
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage, body, difference
+from tests.page.studio import Hold, OpenPage, body, difference
 
 BACKGROUND = 12  # largest difference between colours of the background
 
@@ -93,10 +93,8 @@ def test_a_number_beyond_the_slider_is_refused_with_its_bound(studio: OpenPage) 
 
 
 def test_a_shape_of_another_code_is_grey_below_a_ring_and_has_no_verdict(studio: OpenPage) -> None:
-    held: list[Route] = []
-    free = False
     before = studio.picture()
-    studio.page.route("**/vertices*", lambda route: route.continue_() if free else held.append(route))
+    held = Hold(studio.page, "**/vertices*")
     studio.type(2, 0.5)
     studio.eventually(lambda: studio.waits)
     assert studio["#busy"].is_visible()
@@ -106,9 +104,7 @@ def test_a_shape_of_another_code_is_grey_below_a_ring_and_has_no_verdict(studio:
     clay = (before[..., 0] - before[..., 2]) > 20
     assert clay.mean() > 0.05
     assert ((grey[..., 0] - grey[..., 2])[clay] > 20).mean() < 0.05
-    free = True
-    for route in held:
-        route.continue_()
+    held.release()
     studio.rest()
     assert not studio.waits
     assert studio["#busy"].is_hidden()

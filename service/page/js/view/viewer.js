@@ -364,6 +364,7 @@ export class Viewer {
       offset.multiplyScalar(zooms[event.key]);
     } else if (event.key === "0" || event.key === "Home") {
       this.resetView();
+      this.canvas.dispatchEvent(new Event("turned")); // the address forgets the view
       event.preventDefault();
       return;
     } else return;
