@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage, difference
+from tests.page.studio import OpenPage, difference, pixels
 
 
 def test_material_light_and_ground(studio: OpenPage, window: Open) -> None:
@@ -52,6 +52,17 @@ def test_only_what_differs_from_home_can_be_reset(studio: OpenPage) -> None:
     studio.coordinate(2).locator("[data-do=reset]").press("Enter")
     studio.until_code([0, 0, 0])
     assert studio.page.evaluate("document.activeElement.id") == "z2", "the focus stays in the row"
+
+
+def test_what_is_pressed_is_seen_in_forced_colours(window: Open) -> None:
+    studio = window(forced_colors="active").open()
+    pressed, other = (
+        studio[f"#{name}"].evaluate("b => getComputedStyle(b).backgroundColor") for name in ("fine", "pull")
+    )
+    assert pressed != other
+    picture = pixels(studio.coordinate(0).locator("input[type=range]").screenshot())
+    middle = picture[len(picture) // 2]
+    assert len(np.unique(middle, axis=0)) > 3, "the band, the rest of the track, and the thumb"
 
 
 def test_a_shape_keeps_its_colour_while_a_slider_is_dragged(studio: OpenPage) -> None:
