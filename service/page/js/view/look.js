@@ -16,7 +16,9 @@ const COLOURS = {
 /** Return the colour under a material; a file's own material has the clay's where it is missing. */
 export const colourOf = (material) => COLOURS[material] ?? BASE;
 
-const shared = { vertexColors: true, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
+/** Slightly farther from the camera, so that lines on the surface don't flicker. */
+export const BEHIND = { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 };
+const shared = { ...BEHIND, vertexColors: true };
 const MAKERS = {
   clay: () => new THREE.MeshStandardMaterial({ ...shared, roughness: 0.8 }),
   // A reddish glow stands for light that leaves skin beside the place where it entered.

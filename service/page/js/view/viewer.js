@@ -18,7 +18,7 @@ import {
   sideOf,
   sphereOf,
 } from "./scene.js";
-import { colourOf, materials } from "./look.js";
+import { BEHIND, colourOf, materials } from "./look.js";
 import { Picker } from "./picker.js";
 import { Stage } from "./stage.js";
 
@@ -52,14 +52,10 @@ export class Viewer {
     this.turned = false;
 
     this.material = materials(this.renderer);
-    this.normals = new THREE.MeshNormalMaterial({
-      polygonOffset: true, // as the other materials, see below
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
-    });
+    this.normals = new THREE.MeshNormalMaterial(BEHIND);
     /** @type {THREE.Side} */
     this.side = THREE.FrontSide;
-    this.worn = "clay";
+    this.worn = "own";
     /** A second shape in the same material, if there is one. @type {THREE.Mesh | null} */
     this.companion = null;
     /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
@@ -71,7 +67,6 @@ export class Viewer {
       opacity: 0.55,
     });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
-    // Lines lie on the surface; slightly nearer to the camera, they don't flicker.
     this.picker = new Picker(canvas, this.camera, this.mesh);
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty, because three.js would choose flat shading without normals, and keep it.
@@ -127,7 +122,7 @@ export class Viewer {
     const { skin, mesh } = this;
     if (!mesh.geometry.index) return; // no shape is shown yet
     const wears = Boolean(skin) && mesh.geometry === this.geometries[this.skinOf];
-    this.skinned.visible = wears && this.own && !this.coloured && mesh.material !== this.normals;
+    this.skinned.visible = wears && this.worn === "own" && !this.coloured && mesh.material !== this.normals;
     mesh.visible = !this.skinned.visible;
     if (wears) skin.follow(mesh.geometry);
   }
@@ -170,7 +165,6 @@ export class Viewer {
   /** Set the material, whether lines are shown, and whether colours show normals. */
   style({ wireframe, normals, material, colour }) {
     this.wires.visible = wireframe;
-    this.own = material === "own";
     this.worn = colour === "none" ? material : "clay"; // colours are read on a matt surface
     this.mesh.material = normals ? this.normals : this.surface;
     if (this.companion) this.cover(this.companion);
