@@ -213,7 +213,7 @@ def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_
 
     studio.page.keyboard.press("0")
     studio.eventually(lambda: "view" not in studio.hash)
-    studio["#wireframe"].focus()  # so that the canvas has no focus ring
+    studio["#theme"].focus()  # so that the canvas has no focus ring
     x, y = hand(studio)
     mouse.move(x, y)
     for _ in range(6):

@@ -336,7 +336,7 @@ def test_turn_and_zoom_by_mouse_and_keyboard(studio: OpenPage) -> None:
         zoomed = studio.until_different(zoomed, 0.005)
     studio.eventually(lambda: "view" in studio.hash)
     studio.page.keyboard.press("0")
-    studio["#wireframe"].focus()  # so that the canvas has no focus ring
+    studio["#theme"].focus()  # so that the canvas has no focus ring
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
     assert studio.code == [0, 0, 0]
 
