@@ -63,8 +63,6 @@ export class Reader {
       refuse("No model is loaded yet. Drop the file again when you see a shape.");
     } else if (locked.every(Boolean)) {
       refuse("All coordinates are locked. Unlock at least one, then choose the file again.");
-    } else if (!this.formats.includes(`.${this.#format(file).format ?? "obj"}`)) {
-      refuse(`${file.name}: ${TEXTS["unsupported-media-type"]}`);
     } else if (
       this.readAs.value === "auto" &&
       !this.ownScale.checked &&
@@ -74,9 +72,10 @@ export class Reader {
     } else await this.#fit(file, this.#asked);
   }
 
-  /** Return a file's format by the ending of its name; without an ending, the server finds it out. */
+  /** Return a file's format by a known ending of its name; otherwise the server finds it out. */
   #format({ name }) {
-    return name.includes(".") ? { format: name.split(".").pop().toLowerCase() } : {};
+    const ending = name.split(".").pop().toLowerCase();
+    return this.formats.includes(`.${ending}`) ? { format: ending } : {};
   }
 
   get #asked() {
@@ -145,7 +144,9 @@ export class Reader {
   #fail(file, error) {
     if (error.name === "AbortError") return;
     this.verdict.close();
+    const unknown = !this.#format(file).format && error.type?.endsWith("invalid-mesh");
     if (error.offline) report(error);
+    else if (unknown) say(`${file.name}: ${TEXTS["unsupported-media-type"]}`, { kind: "error", key: "scan" });
     else say(`${file.name}: ${error.message}`, { kind: "error", key: "scan" });
   }
 

@@ -6,7 +6,7 @@ import { baseOf } from "../view/colouring.js";
 import { element, find, readable } from "../dom.js";
 import { reporting, say } from "../messages.js";
 import { CODE } from "./code.js";
-import { picture, record, turntable } from "./video.js";
+import { picture, record, turntable, videoFormats } from "./video.js";
 
 /** Formats of one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
@@ -45,6 +45,16 @@ export class Files {
     this.language.addEventListener("change", () => this.#tell());
     this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
+    /** @type {HTMLSelectElement[]} one beside each button that records */
+    this.video = [...document.querySelectorAll(".video-format")];
+    for (const menu of this.video) {
+      menu.append(
+        ...videoFormats().map((value) => element("option", { value, textContent: value.toUpperCase() })),
+      );
+      menu.addEventListener("change", () => {
+        for (const each of this.video) each.value = menu.value;
+      });
+    }
     store.on(["code", "model", "fine", "colour", "against", "keyframes", "other", "placement"], () =>
       this.#tell(),
     );
@@ -120,7 +130,7 @@ export class Files {
     if (!validity.valid || value === "") throw new Error("Say how many seconds a turn takes, from 1 to 60.");
     return this.#video("turntable", (tell) => {
       tell(seconds);
-      return turntable(this.viewer, seconds);
+      return turntable(this.viewer, seconds, this.video[0].value);
     });
   }
 
@@ -129,7 +139,7 @@ export class Files {
       const { seconds, show } = await this.path.film();
       tell(seconds);
       try {
-        return await record(this.viewer, seconds, show);
+        return await record(this.viewer, seconds, show, this.video[0].value);
       } finally {
         this.path.pause();
       }
@@ -164,16 +174,18 @@ export class Files {
 
   async #animation() {
     const { model, fine } = this.store;
+    const name = find("#path-name").value.trim();
     say("The server makes the animation …", { key: "animation" });
     try {
       await this.#animationFormats(); // they are missing if the server did not answer
       const format = this.animation.value;
       const { links } = await api.interpolation(model, {
         ...this.path.request,
+        ...(name && { name }),
         mesh: fine ? "fine" : "coarse",
       });
       const speed = TIMED.includes(format) ? `&fps=${Math.max(this.path.fps, 1)}` : "";
-      keep(await api.file(links[format] + speed), `${model.name}-animation.${format}`);
+      keep(await api.file(links[format] + speed), `${name || `${model.name}-animation`}.${format}`);
       say("The animation is saved.", { key: "animation" });
     } catch (error) {
       say(error.message, { kind: "error", key: "animation" });
