@@ -118,6 +118,31 @@ def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -
     assert "saved" not in studio.messages
 
 
+def test_a_phone_with_ar_gets_the_shape_as_usdz(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script(
+        "const { supports } = DOMTokenList.prototype;"
+        "DOMTokenList.prototype.supports = function (word) { return word === 'ar' || supports.call(this, word); };"
+    )
+    studio.open("#model=with-fine&z=0.1,1,0.5")
+    studio.tab("Files")
+    link = studio["#ar"]
+    studio.eventually(link.is_visible)
+    assert link.get_attribute("rel") == "ar"
+    # iOS opens its viewer only from a link whose only child is a picture.
+    assert link.evaluate("a => [...a.childNodes].map((child) => child.nodeName)") == ["IMG"]
+    answer = httpx.get(link.evaluate("a => a.href"), timeout=60)
+    assert answer.headers["content-type"] == "model/vnd.usdz+zip"
+    assert "latent=0.1%2C1%2C0.5" in str(answer.url)
+    assert answer.content.startswith(b"PK")
+
+
+def test_no_link_to_ar_elsewhere(studio: OpenPage) -> None:
+    studio.tab("Files")
+    assert studio["#ar"].is_hidden()
+    assert not any("usdz" in address for address in studio.addresses)
+
+
 @pytest.fixture
 def theirs(tmp_path: Path) -> Iterator[str]:
     """The origin of another server, which serves a folder."""

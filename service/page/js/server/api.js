@@ -174,6 +174,14 @@ export const fit = (model, file, format, options, signal) => {
   return json(call(path, { method: "POST", body: file, signal }));
 };
 
+/** Return whether a link without a key can have shapes as USDZ, for which the server needs a package. */
+export const writesUsdz = async (model) =>
+  !here.kept(KEY) &&
+  call(at(model, "mesh", { format: "usdz", mesh: "coarse" })).then(
+    () => true,
+    () => false,
+  );
+
 /** Return a file to save, as a blob. */
 export const file = async (path, body) => (await (body ? post(path, body) : call(path))).blob();
 

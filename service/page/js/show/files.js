@@ -45,8 +45,9 @@ export class Files {
     this.language.addEventListener("change", () => this.#tell());
     this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
-    /** @type {HTMLSelectElement[]} one beside each button that records */
-    this.video = [...document.querySelectorAll(".video-format")];
+    /** @type {NodeListOf<any>} one menu beside each button that records */
+    const menus = document.querySelectorAll(".video-format");
+    this.video = [...menus];
     for (const menu of this.video) {
       menu.append(
         ...videoFormats().map((value) => element("option", { value, textContent: value.toUpperCase() })),
@@ -55,9 +56,15 @@ export class Files {
         for (const each of this.video) each.value = menu.value;
       });
     }
+    this.ar = find("#ar", root);
     store.on(["code", "model", "fine", "colour", "against", "keyframes", "other", "placement"], () =>
       this.#tell(),
     );
+    if (this.ar.relList.supports("ar"))
+      store.on(
+        ["model"],
+        reporting(() => this.#offerAR()),
+      );
     viewer.canvas.addEventListener("turned", () => this.#tell());
     this.format.addEventListener("change", () => this.#tell());
     find("#download", root).addEventListener(
@@ -108,9 +115,24 @@ export class Files {
       model: { name, title },
     } = this.store;
     const view = this.viewer.turned ? this.viewer.view : null;
+    this.ar.href = this.#usdz;
     const embed = `${api.origin}/?embed${toHash(this.store, view)}`;
     const file = `${name}.${this.format.value}`;
     this.code.textContent = CODE[this.language.value]({ url: api.origin + path, body, file, embed, title });
+  }
+
+  /** Return the address of the shape as USDZ, which phones place in the room. */
+  get #usdz() {
+    const { model, code, fine } = this.store;
+    const query = { latent: rounded(code).join(","), format: "usdz", mesh: fine ? "fine" : "coarse" };
+    return `${api.origin}${model.links.mesh}?${new URLSearchParams({ ...query, version: model.version })}`;
+  }
+
+  /** Offer the shape in the room where the browser can show it and the server writes USDZ. */
+  async #offerAR() {
+    const room = find("#room");
+    room.hidden = true;
+    room.hidden = !(await api.writesUsdz(this.store.model));
   }
 
   async #shape() {
