@@ -216,7 +216,7 @@ def test_files_that_are_no_shapes_are_refused_in_words_for_people(window: Open, 
     studio = window(complains=True).open()
     files = {
         "letter.docx": (b"PK\x03\x04 nothing to see", "This file type is not supported. Save a mesh as .obj"),
-        "notes.txt": (b"Dear reader,\nhello\n", "Export the scan again"),
+        "notes.txt": (b"Dear reader,\nhello\n", "Export the file again"),
         "empty.obj": (b"", "Export"),
         "flat.xyz": (b"".join(b"%d %d 0\n" % (k % 30, k // 30) for k in range(900)), "lie in a plane"),
     }

@@ -33,8 +33,7 @@ export const TEXTS = {
   "wrong-length": `The model has another number of coordinates than the page sent. ${RELOAD}`,
   "not-finite": `A number is too large for a shape. ${NUMBERS}`,
   "out-of-bounds": `A number is outside the range of the model. ${NUMBERS}`,
-  "invalid-mesh":
-    "Export the mesh again, or open it as a scan: choose “a scan” under “Read it as” on the tab Files.",
+  "invalid-mesh": "Export the file again from the program that made it.",
   "invalid-scan": "Export the scan again, with points from all of the surface.",
   "no-tangent-space": "This model can’t compute exact shapes.",
   periodic: "This model has angles that go round, so it has no blend shapes.",

@@ -151,7 +151,8 @@ export class Sliders {
     const [low, high] = space.range(k).map((end) => Number(end.toFixed(4)));
     const end = Math.min(Math.max(value, low), high);
     const beyond = end !== value && !space.period[k];
-    if (!beyond || finished) this.#set(k, beyond ? end : value);
+    const taken = space.wrap(k, beyond ? end : value);
+    if ((!beyond || finished) && taken !== this.store.code[k]) this.#set(k, taken);
     this.#warn(k, beyond && `The ${value < low ? "smallest" : "largest"} value here is ${readable(end, 4)}.`);
     box.setAttribute("aria-invalid", String(beyond && !finished));
     if (finished) this.#show();
