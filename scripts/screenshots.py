@@ -44,7 +44,7 @@ def main() -> None:
             return page
 
         page = open_page(FIGURE, viewport=desktop)
-        drawn(page, ".pictures")
+        drawn(page, ".end")
         page.screenshot(path=DOCS / "page-desktop.png")
 
         page = open_page(f"{FIGURE}&keys={POSE};{OTHER}&colour=stretch", viewport=desktop, color_scheme="dark")
@@ -61,7 +61,7 @@ def main() -> None:
         page.screenshot(path=DOCS / "page-beside.png")
 
         page = open_page(FIGURE, viewport=tutorial)
-        drawn(page, ".pictures")
+        drawn(page, ".end")
         save_small(page, DOCS / "tutorial" / "page.webp")
         answer = client.get("/v1/models/figure/mesh", params={"latent": ",".join(["0.2"] * 20), "format": "obj"})
         points = [line.split()[1:] for line in answer.text.splitlines() if line.startswith("v ")]
@@ -73,7 +73,7 @@ def main() -> None:
         save_small(page, DOCS / "tutorial" / "scan.webp")
 
         page = open_page(TORUS, viewport=phone, device_scale_factor=2, is_mobile=True, has_touch=True)
-        drawn(page, ".pictures")
+        drawn(page, ".end")
         page.screenshot(path=DOCS / "page-phone.png")
         browser.close()
 

@@ -219,7 +219,7 @@ class Client:
             keyframes: (k, m) codes, at least two.
             version: version of the model; by default the server's default version.
             quality: quality of the frames, "full" or "draft".
-            options: frames, times, start, stop, loop, mesh.
+            options: frames, times, start, stop, loop, mesh, name.
         """
         body = {"keyframes": _numbers(keyframes), **options}
         answer = self._post(name, "interpolations", {"version": version}, json=body)

@@ -68,6 +68,9 @@ class Animation(Body):
         description="Append the first keyframe and drop the last frame, so that the animation repeats without a jump.",
     )
     mesh: MeshChoice = Field(MeshChoice.FINE, description="The mesh of the frames, fine or coarse.")
+    name: str | None = Field(
+        None, min_length=1, max_length=60, description="Name of the animation in GLB files, `animation` by default."
+    )
 
     @field_validator("times")
     @classmethod

@@ -97,7 +97,8 @@ async def sequence_file(
                     against = model.decoder.reference_shape(mesh).vertices
                 colourings = Colouring.of_frames(colour_by.quantity, vertices, against, whole.connectivity)
             each = found.diagnostics[:number]
-            frames = Frames(vertices, each, whole.faces, animation.positions, codes[:number], surface, fps, colourings)
+            shown = vertices, each, whole.faces, animation.positions, codes[:number], surface, fps, colourings
+            frames = Frames(*shown, animation.name or "animation")
             return encode_frames(frames, format)
 
         return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))

@@ -37,6 +37,7 @@ class Frames:
         surface: attributes of the mesh, if its training file had more than triangles.
         fps: frames per second.
         colourings: of each frame; empty for none.
+        name: of the animation, for formats that hold one.
     """
 
     vertices: NDArray[np.float32]
@@ -47,6 +48,7 @@ class Frames:
     surface: MeshAttributes | None = None
     fps: float = FRAMES_PER_SECOND
     colourings: Sequence[Colouring] = ()
+    name: str = "animation"
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def encode_frames(frames: Frames, format: str) -> tuple[Iterator[Buffer], dict[s
     shown = frames.vertices, frames.faces, frames.surface, frames.fps, frames.colourings
     match format:
         case "glb":
-            animated = animated_glb(*shown)
+            animated = animated_glb(*shown, name=frames.name)
             return iter([animated.data]), {"targets": animated.targets, "max_vertex_error": animated.max_vertex_error}
         case "npz":
             arrays: dict[str, NDArray] = {

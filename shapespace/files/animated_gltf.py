@@ -49,6 +49,7 @@ def animated_glb(
     surface: MeshAttributes | None = None,
     fps: float = FRAMES_PER_SECOND,
     colourings: Sequence[Colouring] = (),
+    name: str = "animation",
 ) -> AnimatedGLB:
     """Encode shapes (n, V, 3) as an animation whose key k, at ``k / fps`` seconds, shows frame k.
 
@@ -66,6 +67,7 @@ def animated_glb(
         surface: polygons, texture coordinates and materials of the mesh, if any.
         fps: frames per second.
         colourings: colours for each frame, or empty.
+        name: name of the animation and of the mesh.
     """
     frames = frames.astype(np.float32, copy=False)
     rest = frames[0].astype(np.float64)
@@ -90,7 +92,7 @@ def animated_glb(
         shown = np.tensordot(keys[1:].astype(np.float64), targets[:, block], 1)
         error = max(error, float(np.linalg.norm(shown - displacements, axis=-1).max(initial=0)))
     first = colourings[0] if colourings else None
-    document = GltfBuilder(rest, faces, first, surface, name="animation")
+    document = GltfBuilder(rest, faces, first, surface, name=name)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
         kind = "frame" if len(frames) <= DENSE_FRAMES else "component"
@@ -99,7 +101,7 @@ def animated_glb(
         times = document.add(np.arange(len(frames)) / fps, bounds=True)
         sampler = {"input": times, "output": document.add(keys.ravel()), "interpolation": "LINEAR"}
         channels = [{"sampler": 0, "target": {"node": k, "path": "weights"}} for k in range(document.nodes)]
-        document.tree["animations"] = [{"name": "animation", "samplers": [sampler], "channels": channels}]
+        document.tree["animations"] = [{"name": name, "samplers": [sampler], "channels": channels}]
     document.tree["asset"]["extras"] = {
         "frames": len(frames),
         "targets": len(targets),

@@ -11,10 +11,24 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import ConsoleMessage, Locator, Page, Request
+from playwright.sync_api import ConsoleMessage, Locator, Page, Request, Route
 
 T = TypeVar("T")
 PATIENCE = 120.0  # seconds; the machine may be busy with other things
+
+
+class Hold:
+    """Holds the requests to addresses that match a pattern, until `release`; `routes` has those that are held."""
+
+    def __init__(self, page: Page, address: str) -> None:
+        self.routes: list[Route] = []
+        self._released = False
+        page.route(address, lambda route: route.continue_() if self._released else self.routes.append(route))
+
+    def release(self) -> None:
+        self._released = True
+        for route in self.routes:
+            route.continue_()
 
 
 class OpenPage:
@@ -83,6 +97,11 @@ class OpenPage:
         """Whether the drawn shape is a draft or full."""
         return self.page.locator(".stage").get_attribute("data-quality")
 
+    @property
+    def waits(self) -> bool:
+        """Whether the drawn shape, if any, is marked as that of another code."""
+        return self.page.locator(".stage").get_attribute("aria-busy") == "true"
+
     def __getitem__(self, selector: str) -> Locator:
         return self.page.locator(selector)
 
@@ -137,11 +156,11 @@ class OpenPage:
         return pixels(self.page.screenshot(clip=clip))
 
     def until_different(self, before: np.ndarray, share: float = 0.002) -> np.ndarray:
-        """Wait until the picture differs from another, and return it."""
+        """Wait until the picture differs from another and shows the shape of the code, and return it."""
 
         def changed() -> np.ndarray | None:
             now = self.picture()
-            return now if difference(before, now) > share else None
+            return now if difference(before, now) > share and not self.waits else None
 
         return self.eventually(changed)
 

@@ -16,6 +16,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Open
 from tests.page.studio import OpenPage, difference
+from tests.service.glb import GLB
 
 
 def move(studio: OpenPage, code: tuple[float, ...] = CODE) -> None:
@@ -78,6 +79,13 @@ def test_a_download_of_the_path(studio: OpenPage, expected: np.ndarray) -> None:
         else:
             begins = {"glb": b"glTF", "pc2": b"POINTCACHE2", "usd": b"PXR", "usdz": b"PK"}
             assert content.startswith(begins[format])
+    studio["#path-name"].fill("Grow and twist")
+    studio["#animation-format"].select_option("glb")
+    with studio.page.expect_download() as download:
+        studio["#download-animation"].click()
+    assert download.value.suggested_filename == "Grow and twist.glb"
+    glb = GLB(Path(download.value.path()).read_bytes())
+    assert [animation["name"] for animation in glb.tree["animations"]] == ["Grow and twist"]
 
 
 def test_the_copied_calls_answer_the_shape(studio: OpenPage, expected: np.ndarray, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from tests.service.watching import free_port
 
 def without(studio: OpenPage) -> None:
     studio.eventually(studio["#without"].is_visible)
+    assert studio["#lost"].is_hidden()
     assert "WebGL" in studio["#without"].inner_text()
     assert "v1/models/NAME/mesh" in studio["#without"].inner_text()
     assert studio["#without a"].first.is_visible()
@@ -50,7 +51,7 @@ def test_nothing_can_be_pressed_before_the_model_is_there(window: Open) -> None:
         studio[selector].evaluate("e => e.focus()")
         assert studio[selector].evaluate("e => document.activeElement !== e"), selector
     studio["#mesh-file"].set_input_files({"name": "a.obj", "mimeType": "model/obj", "buffer": b"v 0 0 0"})
-    studio.eventually(lambda: "No model is there yet" in studio.messages)
+    studio.eventually(lambda: "No model is loaded yet" in studio.messages)
     assert "null" not in studio.messages
     held[0].continue_()
     studio.rest()
@@ -164,7 +165,7 @@ def test_legend_and_diagnostics_lie_apart(window: Open, width: int, height: int)
                 b["y"] + b["height"] <= a["y"] + 1,
             )
             assert any(apart), boxes
-    studio["#reset-all"].scroll_into_view_if_needed()
+    studio["#name"].scroll_into_view_if_needed()
     assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 

@@ -23,7 +23,7 @@ def test_people_name_things_for_themselves(window: Open) -> None:
     assert headings(studio) == [own[0], "Figure and twist"]
     assert studio.coordinate(1).locator(".name").inner_text() == "<b>Turn</b>"
     assert slider.get_attribute("aria-label") == "Figure and twist, <b>Turn</b>"
-    assert studio.page.get_by_role("button", name="Reset all of Figure and twist").count() == 1
+    assert studio.page.get_by_role("button", name="Reset all of Figure and twist", include_hidden=True).count() == 1
 
     studio.page.reload()
     studio.rest()

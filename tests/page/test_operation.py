@@ -1,12 +1,16 @@
 """The page as a whole: models, errors, a server that stops and starts, accessibility, download size."""
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from playwright.sync_api import Route
 
+from shapespace.service.http.problems import KINDS
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage, difference
 from tests.service.bundles import write_bundle
@@ -24,17 +28,18 @@ def test_the_models_and_their_cards(studio: OpenPage) -> None:
     for fact in (
         "A torus for tests.",
         "with-fine · version 1 · CC0-1.0",
-        "composite",
-        "64",
+        "This model",
+        "64 vertices",
         "Digest",
-        "unseen shapes",
-        "3 %",
-        "5 %",
-        "a linear model with as many numbers",
-        "random shapes, to the nearest trained on",
-        "how far they stray",
+        "shapes that training has not seen",
+        "3\u00a0%",
+        "5\u00a0%",
+        "away from the nearest training shape",
+        "With as many principal components",
     ):
         assert fact in card
+    bars = studio["#card .bar"].evaluate_all("bars => bars.map((bar) => bar.getBoundingClientRect().width)")
+    assert bars[0] / bars[1] == pytest.approx(3 / 5, rel=0.02)
     studio.page.keyboard.press("Escape")
     small = studio.picture()
     studio["#model"].select_option("Figure")
@@ -42,6 +47,12 @@ def test_the_models_and_their_cards(studio: OpenPage) -> None:
     studio.until_different(small, 0.02)
     assert studio["#undo"].is_disabled()
     assert "Figure" in studio.page.title()
+    studio["#about"].click()
+    studio.eventually(lambda: "A mannequin" in studio["#card"].inner_text())
+    card = studio["#card"].inner_text()
+    assert "99.995\u00a0%" in card
+    assert "100\u00a0%" not in card, "what is nearly all is not all"
+    assert "_" not in card, "names in words"
 
 
 def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> None:
@@ -75,14 +86,36 @@ def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> 
 def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
     studio = window(complains=True).open()
     before = studio.picture()
-    studio.type(0, 1e39)
+    refusal = json.dumps({"type": "urn:shapespace:problem:not-finite", "detail": "Send finite numbers for latents."})
+
+    def refuse(route: Route) -> None:
+        is_shown = '"fine"' in (route.request.post_data or "")  # the small pictures are coarse
+        route.fulfill(status=422, body=refusal) if is_shown else route.continue_()
+
+    studio.page.route("**/vertices*", refuse)
+    studio.type(0, 0.12)
     message = studio.eventually(lambda: studio["#messages .error"].first.inner_text() or None)
-    assert "Send finite numbers" in message
+    assert "A number is too large for a shape" in message
+    assert "latents" not in message, "the server's words are for programs"
     assert studio["#messages"].get_attribute("aria-live") == "polite"
+    # The shape of the code before stays, in grey, and nothing vouches for it.
+    assert "stale" in (studio[".stage"].get_attribute("class") or "")
+    assert studio["#diagnostics summary"].inner_text() == "No shape for these values"
+    assert studio["#busy"].is_hidden()
     studio["#messages .error button"].first.click()
     assert studio["#messages .error"].count() == 0
+    studio.page.unroute("**/vertices*")
     studio.type(0, 0.1)
     studio.until_different(before)
+    assert "stale" not in (studio[".stage"].get_attribute("class") or "")
+
+
+def test_every_problem_of_the_server_has_words_for_people(studio: OpenPage) -> None:
+    texts = studio.page.evaluate("async () => (await import('/page/js/server/problems.js')).TEXTS")
+    assert {*texts} == {*KINDS}
+    for kind, text in texts.items():
+        assert re.fullmatch(r"[^?=&{}`/]+\.", text), kind
+        assert not re.search(r"JSON|HTTP|Content-Type|Accept|parameter|header|latent|\bSend\b", text), kind
 
 
 def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, models: Path) -> None:
@@ -109,6 +142,9 @@ def test_a_server_with_a_key(window: Open, start: Start, models: Path) -> None:
     server = start(models, api_key="open-sesame")
     studio = window(server.url, complains=True)
     studio.page.goto(server.url)
+    studio.eventually(studio["#key"].is_visible)
+    studio.page.evaluate(AXE.read_text())
+    check(studio, "key")
     studio["#key input"].fill("open-sesame")
     studio["#key input"].press("Enter")
     studio.rest()
@@ -141,10 +177,24 @@ def test_no_model_is_said(window: Open, start: Start, tmp_path: Path) -> None:
     studio.eventually(lambda: "No model is served" in studio.messages)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
-    studio = window(color_scheme=scheme).open()
+LOOKS: dict[str, dict[str, Any]] = {
+    "light": {},
+    "dark": {"color_scheme": "dark"},
+    "phone": {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True},
+}
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_axe_finds_no_fault(window: Open, look: str) -> None:
+    studio = window(**LOOKS[look]).open()
     studio.page.evaluate(AXE.read_text())
+    studio["#to-look"].click()
+    studio.eventually(studio["#look"].is_visible)
+    check(studio, "look")
+    studio.page.keyboard.press("Escape")
+    if look == "phone":
+        studio["#to-more"].click()
+        check(studio, "menu")
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
     check(studio, "card")
@@ -164,6 +214,10 @@ def test_axe_finds_no_fault(window: Open, scheme: str) -> None:
         if tab == "Colour":
             studio.page.get_by_label("stretch").check()
             studio.eventually(studio["#legend"].is_visible)
+        if tab == "Files":
+            scan = httpx.get(f"{studio.url}/v1/models/with-fine/mesh?latent=0.1,0,0.5&format=obj").content
+            studio["#mesh-file"].set_input_files({"name": "a.obj", "mimeType": "model/obj", "buffer": scan})
+            studio.eventually(lambda: "code of a.obj" in studio["#verdict h2"].inner_text())
         check(studio, tab)
 
 
@@ -178,8 +232,11 @@ def test_everything_is_reached_by_keyboard(studio: OpenPage) -> None:
         return studio.page.evaluate("document.activeElement.id || document.activeElement.dataset.do || ''")
 
     reached = set()
+    studio.slide(2, 0.5)
+    studio["#canvas"].press("ArrowLeft")  # what is back at its start cannot be reset
+    studio.eventually(studio["#reset-view"].is_visible)
     studio["#model"].focus()
-    for _ in range(50):
+    for _ in range(60):
         reached.add(focused())
         studio.page.keyboard.press("Tab")
     assert {

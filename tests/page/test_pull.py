@@ -6,7 +6,7 @@ import numpy as np
 from playwright.sync_api import Locator
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage, difference
+from tests.page.studio import Hold, OpenPage, difference
 from tests.page.test_operation import AXE, check
 
 
@@ -124,7 +124,7 @@ def test_what_is_locked_stays_though_something_else_is_pulled(window: Open) -> N
     sent = edits(studio)
     studio["#pull"].click()
     pull(studio, hand(studio), (20, -40))
-    studio.eventually(lambda: "The pin was not met" in studio.messages and "was left as it was" in studio.messages)
+    studio.eventually(lambda: "does not reach the pin" in studio.messages and "stays as it was" in studio.messages)
     assert "Unlock" in studio.messages
     assert set(map(int, sent[-1]["fixed"])) == set(locked)
     assert studio.code == [] or not any(studio.code)
@@ -134,3 +134,110 @@ def test_what_is_locked_stays_though_something_else_is_pulled(window: Open) -> N
     studio["#theme"].focus()
     studio.rest()
     studio.eventually(lambda: difference(before, studio.picture()) < 0.001)
+
+
+def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happens(window: Open) -> None:
+    studio = window().open("#model=figure")
+    studio["#pull"].click()
+    mouse = studio.page.mouse
+    x, y = hand(studio)
+    mouse.move(x + 40, y)
+    assert studio["#hover"].is_hidden()
+    mouse.move(x + 15, y)  # the hand ends 6 pixels to the right of the place
+    studio.eventually(studio["#hover"].is_visible)
+    marked = studio["#hover"].bounding_box()
+    assert marked
+    assert np.hypot(marked["x"] + 8 - x - 15, marked["y"] + 8 - y) < 13
+    held = Hold(studio.page, "**/edit*")
+    mouse.down()
+    assert studio["#hover"].is_hidden()
+    mouse.move(x + 45, y - 40)
+    studio.eventually(lambda: studio[".pin.busy"].count() == 1)
+    ends = studio["#threads line"].evaluate(
+        "line => ['x1', 'y1', 'x2', 'y2'].map((name) => Number(line.getAttribute(name)))"
+    )
+    assert np.hypot(ends[2] - ends[0], ends[3] - ends[1]) > 40, "a line joins the pin to the vertex, far away"
+    assert "view" not in studio.hash, "a near miss does not turn the view"
+    mouse.up()
+    held.release()
+    studio.eventually(lambda: studio[".pin.busy"].count() == 0)
+    studio.until_code(studio.eventually(lambda: studio.code if any(studio.code) else None))
+
+
+def test_a_finger_pulls_and_a_second_one_does_not_turn_the_view(window: Open) -> None:
+    studio = window(viewport={"width": 390, "height": 760}, has_touch=True, is_mobile=True).open("#model=figure")
+    studio["#pull"].tap()
+    devtools = studio.page.context.new_cdp_session(studio.page)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        places = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": places})
+
+    x, y = hand(studio)
+    touch("touchStart", (x + 20, y))
+    touch("touchMove", (x + 30, y - 20))
+    touch("touchStart", (x + 30, y - 20), (x - 60, y + 90))
+    touch("touchMove", (x + 30, y - 30), (x - 90, y + 60))
+    touch("touchEnd")
+    studio.eventually(lambda: any(studio.code))
+    assert studio[".pin"].count() == 1
+    studio.rest()
+    assert "view" not in studio.hash
+
+
+def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_a_double_click(
+    window: Open,
+) -> None:
+    studio = window().open("#model=figure")
+    mouse = studio.page.mouse
+    box = studio["#canvas"].bounding_box()
+    assert box
+    beside = box["x"] + 30, box["y"] + 150
+    mouse.move(*beside)
+    mouse.down()
+    mouse.move(beside[0], beside[1] - 300, steps=5)  # up, so that the camera goes down
+    mouse.up()
+
+    def view() -> tuple[np.ndarray, np.ndarray]:
+        numbers = [float(part) for part in studio.hash["view"].split(",")]
+        return np.array(numbers[:3]), np.array(numbers[3:])
+
+    studio.eventually(lambda: "view" in studio.hash)
+    position, target = view()
+    assert position[1] >= target[1] - 1e-4
+    studio["#canvas"].focus()
+    for _ in range(3):
+        studio.page.keyboard.press("ArrowDown")
+    studio.page.wait_for_timeout(300)
+    assert view()[0][1] >= view()[1][1] - 1e-4
+
+    studio.page.keyboard.press("0")
+    studio.eventually(lambda: "view" not in studio.hash)
+    studio["#theme"].focus()  # so that the canvas has no focus ring
+    x, y = hand(studio)
+    mouse.move(x, y)
+    for _ in range(6):
+        mouse.wheel(0, -200)
+    studio.eventually(lambda: "view" in studio.hash and np.linalg.norm(np.subtract(*view())) < 1.5)
+    near = studio.eventually(lambda: hand_near(studio, x, y))
+    assert near, "the hand stays under the pointer"
+    mouse.dblclick(x, y)
+    studio.eventually(lambda: covers(studio))
+
+
+def hand_near(studio: OpenPage, x: float, y: float) -> bool:
+    """Whether the shape is drawn under a place of the window."""
+    picture, box = studio.picture(), studio["#canvas"].bounding_box()
+    assert box
+    row, column = int(y - box["y"] - 60), int(x - box["x"])
+    part = picture[max(row - 8, 0) : row + 8, max(column - 8, 0) : column + 8]
+    return bool((np.abs(part - picture[0, 0]).max(axis=2) > 40).any())
+
+
+def covers(studio: OpenPage) -> bool:
+    """Whether all of the figure is drawn, in the middle."""
+    picture = studio.picture()
+    rows, columns = np.nonzero(picture[..., 0] - picture[..., 2] > 20)
+    height, width = picture.shape[:2]
+    inside = columns.min() > 3 and columns.max() < width - 3
+    return bool(inside and np.ptp(rows) > 0.6 * height and abs(columns.mean() - width / 2) < 0.15 * width)

@@ -1,5 +1,6 @@
 """Files not in correspondence: scans shown over the shape, verdicts, and undo."""
 
+import re
 from dataclasses import dataclass
 
 import httpx
@@ -75,10 +76,10 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
     studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console logs that `encode` refuses it
     start = studio.picture()
     choose(studio, given.file(name))
-    words = until_said(studio, f"Figure explains {name}")
+    words = until_said(studio, f"Figure fits {name}")
     studio.until_code(CODE, 0.12)
     assert "of the diagonal" in words
-    assert "100 % of the scan lie at the shape" in words
+    assert "100 % of the scan lies on the shape" in words
     studio["#verdict summary"].click()
     assert "in the model's units" in verdict(studio)
     studio.rest()
@@ -115,7 +116,7 @@ def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Ope
     studio.tab("Files")
     studio["#read-as"].select_option("part")
     choose(studio, Given(given.vertices[used], index.reshape(-1, 3)).file("top.ply"))
-    until_said(studio, "Figure explains top.ply")
+    until_said(studio, "Figure fits top.ply")
     studio["#ghost"].uncheck()
     studio.tab("Colour")
     studio["[name=colour][value=distance]"].check()
@@ -153,7 +154,7 @@ def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) 
     assert "scale=" not in words
     assert not any(studio.code)
     studio.page.get_by_role("button", name="Fit it with its own scale").click()
-    until_said(studio, "Figure explains millimetres.stl")
+    until_said(studio, "Figure fits millimetres.stl")
     studio.until_code(CODE, 0.12)
     studio["#verdict summary"].click()
     times = verdict(studio).split(" times the model's size")[0].split(" ")[-1]
@@ -170,8 +171,8 @@ def test_what_is_no_such_shape_leaves_the_user_their_own(window: Open) -> None:
     cube[np.arange(3000), np.arange(3000) % 3] = np.where(np.arange(3000) % 2, -0.4, 0.4)
     content = "\n".join(" ".join(map(repr, row)) for row in cube.tolist()).encode()
     choose(studio, {"name": "cube.xyz", "mimeType": "text/plain", "buffer": content})
-    until_said(studio, "cube.xyz is no such shape, or the search went astray")
-    assert "Your shape was left as it was" in verdict(studio)
+    until_said(studio, "cube.xyz is not a shape of this model, or the search failed")
+    assert "Your shape stays as it was" in verdict(studio)
     assert studio.code == pytest.approx(mine)
     studio.page.get_by_role("button", name="Show what was found").click()
     studio.eventually(lambda: studio.code != pytest.approx(mine))
@@ -195,6 +196,37 @@ def test_a_fit_keeps_what_is_locked_and_can_be_given_up(window: Open, given: Giv
         studio.page.get_by_role("button", name="Back to my shape")
     ).first.click()
     assert studio.code[:3] == [0.1] * 3
+
+
+def test_the_best_fit_at_the_time_limit_is_shown(window: Open, given: Given) -> None:
+    studio = window().open(FIGURE)
+
+    def late(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, json=answer.json() | {"status": "deadline"})
+
+    studio.page.route("**/fit?*", late)
+    choose(studio, given.file("points.xyz"))
+    words = until_said(studio, "The time limit is reached. This is the best fit to points.xyz so far")
+    assert "use fewer points" in words
+    studio.until_code(CODE, 0.12)
+
+
+def test_files_that_are_no_shapes_are_refused_in_words_for_people(window: Open, given: Given) -> None:
+    studio = window(complains=True).open()
+    files = {
+        "letter.docx": (b"PK\x03\x04 nothing to see", "This file type is not supported. Save a mesh as .obj"),
+        "notes.txt": (b"Dear reader,\nhello\n", "Export the file again"),
+        "empty.obj": (b"", "Export"),
+        "flat.xyz": (b"".join(b"%d %d 0\n" % (k % 30, k // 30) for k in range(900)), "lie in a plane"),
+    }
+    for name, (content, words) in files.items():
+        choose(studio, {"name": name, "mimeType": "", "buffer": content})
+        message = studio.eventually(lambda: text if name in (text := studio["#messages"].inner_text()) else None)  # noqa: B023
+        assert words in message
+        assert not re.search(r"[?=]|Content-Type|Send|Ask|JSON", message), message
+        assert studio["#verdict"].is_hidden()
+        studio["#messages .error button"].first.click()
 
 
 def test_a_part_is_fitted_as_a_part(window: Open, given: Given) -> None:

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Route
 
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage, body, difference
+from tests.page.studio import Hold, OpenPage, body, difference
 
 BACKGROUND = 12  # largest difference between colours of the background
 
@@ -70,6 +70,70 @@ def test_the_range_of_the_training_data_is_marked_and_leaving_it_is_said(studio:
     studio.slide(2, 1.2)
     assert "outside" in (studio.coordinate(2).get_attribute("class") or "")
     studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
+
+
+def test_a_number_beyond_the_slider_is_refused_with_its_bound(studio: OpenPage) -> None:
+    studio.asked.clear()
+    box = studio.coordinate(0).locator("input[type=number]")
+    line = studio.coordinate(0).locator(".bound")
+    for typed, words, end in ((99, "largest", 0.32), (-99, "smallest", -0.32), (1e39, "largest", 0.32)):
+        box.fill(str(typed))
+        assert line.inner_text() == f"The {words} value here is {end}."
+        assert box.get_attribute("aria-invalid") == "true"
+        assert float(box.input_value()) == typed, "it may be the beginning of another number"
+        box.press("Enter")
+        assert float(box.input_value()) == end
+        assert box.get_attribute("aria-invalid") == "false"
+        studio.until_code([end, 0, 0])
+    box.fill("0.1")
+    assert line.is_hidden()
+    studio.until_code([0.1, 0, 0])
+    studio.rest()
+    assert all(abs(asked["latents"][0][0]) < 0.4 for asked in studio.asked)
+
+
+def test_a_shape_of_another_code_is_grey_below_a_ring_and_has_no_verdict(studio: OpenPage) -> None:
+    before = studio.picture()
+    held = Hold(studio.page, "**/vertices*")
+    studio.type(2, 0.5)
+    studio.eventually(lambda: studio.waits)
+    assert studio["#busy"].is_visible()
+    assert studio["#diagnostics summary"].inner_text() == "Computing this shape …"
+    assert studio["#found li"].count() == 0
+    grey = studio.picture()
+    clay = (before[..., 0] - before[..., 2]) > 20
+    assert clay.mean() > 0.05
+    assert ((grey[..., 0] - grey[..., 2])[clay] > 20).mean() < 0.05
+    held.release()
+    studio.rest()
+    assert not studio.waits
+    assert studio["#busy"].is_hidden()
+    assert studio["#found li"].count() > 1
+
+
+def test_the_verdict_is_that_of_the_draft_on_the_screen(studio: OpenPage) -> None:
+    studio.page.route("**/vertices*", lambda route: '"full"' in (route.request.post_data or "") or route.continue_())
+    studio.type(2, 1.2)
+    studio.eventually(lambda: "Outside the range" in (studio["#diagnostics"].text_content() or ""))
+    studio.eventually(lambda: studio.quality == "draft")
+    studio.type(2, 0.5)
+    studio.eventually(lambda: "Inside the range" in (studio["#diagnostics"].text_content() or ""))
+    assert studio.quality == "draft"
+    studio.page.unroute("**/vertices*")
+
+
+def test_random_draws_likely_shapes_unless_the_menu_says_otherwise(window: Open) -> None:
+    studio = window().open("#model=figure")
+    asked: list[dict[str, object]] = []
+    studio.page.on("request", lambda request: "/sample" in request.url and asked.append(request.post_data_json))
+    studio["#random"].click()
+    studio.eventually(lambda: any(studio.code))
+    likely = studio.code
+    studio["#distribution"].select_option("uniform")
+    studio.eventually(lambda: studio.code != likely and len(asked) == 2)
+    assert [body["distribution"] for body in asked] == ["population", "uniform"]
+    assert asked[0]["seed"] == asked[1]["seed"]
+    assert np.abs(likely).mean() < np.abs(studio.code).mean()
 
 
 def test_an_angle_goes_round(studio: OpenPage) -> None:
@@ -148,8 +212,8 @@ def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) 
 
 def test_nothing_jumps_as_a_draft_comes_to_rest(window: Open) -> None:
     studio = window().open("#model=figure")
-    every = studio[".pictures canvas"].count()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
+    every = studio[".end canvas"].count()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == every)
     held: list[Route] = []
     studio.page.route(
         "**/vertices*",
@@ -180,9 +244,9 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
 
     studio.page.route("**/vertices*", off)
     studio.open()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
     chip = studio["#diagnostics summary"]
-    assert chip.inner_text() == "Fits, inside, usual", "all shapes of this model have as large a residual"
+    assert chip.inner_text() == "Looks right", "all shapes of this model have as large a residual"
     assert studio["#diagnostics"].get_attribute("class") == "good"
     assert studio["#found"].is_hidden()
     chip.click()
@@ -272,7 +336,7 @@ def test_turn_and_zoom_by_mouse_and_keyboard(studio: OpenPage) -> None:
         zoomed = studio.until_different(zoomed, 0.005)
     studio.eventually(lambda: "view" in studio.hash)
     studio.page.keyboard.press("0")
-    studio["#wireframe"].focus()  # so that the canvas has no focus ring
+    studio["#theme"].focus()  # so that the canvas has no focus ring
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
     assert studio.code == [0, 0, 0]
 
@@ -309,22 +373,23 @@ def test_the_fine_shape_lies_where_the_coarse_one_does(window: Open) -> None:
 
 def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window: Open) -> None:
     studio = window().open("#model=figure")
-    every = studio[".pictures canvas"].count()
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == every)
+    every = studio[".end canvas"].count()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == every)
 
     def blue(picture: np.ndarray) -> np.ndarray:
         return (picture[..., 2] - picture[..., 0]) > 50
 
     # Folded factors show a picture of the part of the shape that they change.
     folds = studio[".factor details"]
-    assert [fold.get_attribute("open") is not None for fold in folds.all()] == [True] + [False] * (folds.count() - 1)
+    unfolded = [fold.get_attribute("open") is not None for fold in folds.all()]
+    assert unfolded == [True, True] + [False] * (folds.count() - 2), "enough for three sliders"
     pictures = [body(canvas) for canvas in studio[".factor summary canvas"].all()]
     for picture in pictures:
         assert 0.01 < (blue(picture) & (picture[..., 3] > 0)).mean() < 0.5
     # No two pictures are alike; pictures of the whole shape nearly would be.
     assert all(np.abs(a - b).mean() > 5 for i, a in enumerate(pictures) for b in pictures[:i])
-    studio[".factor summary"].nth(1).click()
-    assert studio["#z2"].is_visible()
+    studio[".factor summary"].nth(2).click()
+    assert studio["#z4"].is_visible()
 
     studio["#canvas"].hover()
     studio.eventually(lambda: not blue(studio.picture()).any())
@@ -345,11 +410,11 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
 
 
 def test_pictures_of_each_coordinate(studio: OpenPage) -> None:
-    studio.eventually(lambda: studio[".pictures canvas.drawn"].count() == 9)
-    less, mean, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(3))
-    covered = [(picture[..., 3] > 0).mean() for picture in (less, mean, more)]
-    assert covered[0] < covered[1] < covered[2], "this coordinate scales the shape"
-    studio.coordinate(0).locator(".pictures button").nth(2).click()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
+    less, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(2))
+    covered = [(picture[..., 3] > 0).mean() for picture in (less, more)]
+    assert covered[0] < covered[1], "this coordinate scales the shape"
+    studio.coordinate(0).locator(".end").nth(1).click()
     studio.until_code([0.2, 0, 0])
 
 
@@ -390,10 +455,18 @@ def test_a_phone_and_a_finger(window: Open) -> None:
     for i in range(1, 6):
         touch("touchMove", (x - 20 - 8 * i, y), (x + 20 + 8 * i, y))
     touch("touchEnd")
-    studio.until_different(turned, 0.01)
+    pinched = studio.until_different(turned, 0.01)
+    target = studio.eventually(lambda: studio.hash.get("view")).split(",")[3:]
+    touch("touchStart", (x - 20, y), (x + 20, y))
+    for i in range(1, 6):
+        touch("touchMove", (x - 20, y + 10 * i), (x + 20, y + 10 * i))
+    touch("touchEnd")
+    studio.until_different(pinched, 0.01)
+    studio.eventually(lambda: studio.hash["view"].split(",")[3:] != target)
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.scroll_into_view_if_needed()
-    slider.tap(position={"x": 200, "y": 12})
+    width = (slider.bounding_box() or {"width": 0.0})["width"]
+    slider.tap(position={"x": 0.8 * width, "y": 12})
     studio.eventually(lambda: bool(studio.code) and studio.code[0] > 0)  # the picture may still change
     studio.page.get_by_role("tab", name="Path").tap()
     assert studio["#add-keyframe"].is_visible()

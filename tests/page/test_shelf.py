@@ -194,6 +194,30 @@ def test_the_view_stays_as_it_was_turned(studio: OpenPage, window: Open) -> None
     studio.eventually(lambda: "view" not in studio.hash)
 
 
+def test_two_shapes_fit_however_near_the_view_was(studio: OpenPage) -> None:
+    studio["#keep-shape"].click()
+    studio.slide(0, 0.2)
+    studio["#canvas"].focus()
+    for key in ("+",) * 6 + ("ArrowRight",) * 4:
+        studio.page.keyboard.press(key)
+    studio.rest()
+    alone = studio.picture()
+    near = studio.eventually(lambda: studio.hash.get("view"))
+    compare = studio.page.get_by_role("button", name="Compare with Shape 1")
+    compare.click()
+    studio["#canvas"].hover()
+    both = studio.until_different(alone, 0.02)
+    studio.eventually(lambda: studio.hash["view"] != near)
+    edges = np.concatenate([both[:, :3].reshape(-1, 3), both[:, -3:].reshape(-1, 3)])
+    assert np.ptp(edges, axis=0).max() < 24, "a shape is cut off"
+    compare.click()
+    studio.eventually(lambda: np.allclose(numbers(studio.hash["view"]), numbers(near), atol=1e-3))
+
+
+def numbers(view: str) -> list[float]:
+    return [float(number) for number in view.split(",")]
+
+
 def test_two_windows_have_one_shelf(studio: OpenPage) -> None:
     other = OpenPage(studio.page.context.new_page(), studio.url).open()
     studio["#keep-shape"].click()

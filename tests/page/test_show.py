@@ -74,6 +74,7 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
 
     plain = window().page  # a page without content security policy
     plain.goto("about:blank")
+    studio[".video-format"].first.select_option("webm")
     studio["#turntable-seconds"].fill("5")  # long enough for a busy machine to record some of it
     name, content = kept(studio, "#turntable")
     assert name == "with-fine-turntable.webm"
@@ -95,6 +96,13 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     studio.until_code([0.2, 0, 1])
     studio.rest()
 
+    studio[".video-format"].last.select_option("mp4")
+    name, content = kept(studio, "#film")
+    assert name == "with-fine-animation.mp4"
+    assert content[4:8] == b"ftyp"
+    assert b"avc1" in content
+    studio.until_code([0.2, 0, 1])
+
 
 def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -> None:
     studio = window().open("#model=with-fine")
@@ -108,6 +116,31 @@ def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -
     studio["#turntable"].click()
     studio.eventually(lambda: "This browser records no pictures of the shape." in studio.messages, 30)
     assert "saved" not in studio.messages
+
+
+def test_a_phone_with_ar_gets_the_shape_as_usdz(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script(
+        "const { supports } = DOMTokenList.prototype;"
+        "DOMTokenList.prototype.supports = function (word) { return word === 'ar' || supports.call(this, word); };"
+    )
+    studio.open("#model=with-fine&z=0.1,1,0.5")
+    studio.tab("Files")
+    link = studio["#ar"]
+    studio.eventually(link.is_visible)
+    assert link.get_attribute("rel") == "ar"
+    # iOS opens its viewer only from a link whose only child is a picture.
+    assert link.evaluate("a => [...a.childNodes].map((child) => child.nodeName)") == ["IMG"]
+    answer = httpx.get(link.evaluate("a => a.href"), timeout=60)
+    assert answer.headers["content-type"] == "model/vnd.usdz+zip"
+    assert "latent=0.1%2C1%2C0.5" in str(answer.url)
+    assert answer.content.startswith(b"PK")
+
+
+def test_no_link_to_ar_elsewhere(studio: OpenPage) -> None:
+    studio.tab("Files")
+    assert studio["#ar"].is_hidden()
+    assert not any("usdz" in address for address in studio.addresses)
 
 
 @pytest.fixture
@@ -124,6 +157,8 @@ def test_the_viewer_in_a_page_of_another_origin(
     window: Open, start: Start, models: Path, theirs: str, tmp_path: Path
 ) -> None:
     studio = window().open("#model=with-fine&z=0.1,1,0.5")
+    studio["#canvas"].press("ArrowRight")
+    view = studio.eventually(lambda: studio.hash.get("view"))
     studio.tab("Files")
     studio["#language"].select_option("a frame in a page")
     code = studio["#code"].text_content() or ""
@@ -145,7 +180,7 @@ def test_the_viewer_in_a_page_of_another_origin(
     for name in ("header", ".panel", ".tools", ".status"):
         assert frame.locator(name).is_hidden(), name
     whole = frame.locator("#whole")
-    other.eventually(lambda: (whole.get_attribute("href") or "").endswith("/#model=with-fine&z=0.1,1,0.5"))
+    other.eventually(lambda: (whole.get_attribute("href") or "").endswith(f"/#model=with-fine&z=0.1,1,0.5&view={view}"))
     picture = pixels(other.page.locator("iframe").screenshot())
     shown = np.abs(picture - picture[5, 5]).max(axis=2) > 60
     assert np.ptp(np.flatnonzero(shown[:, 10:-10].any(axis=1))) > 0.4 * len(picture)

@@ -57,6 +57,13 @@ def test_the_fine_mesh_wears_its_texture(tmp_path: Path, start: Start, window: O
     studio.eventually(lambda: share(studio.picture(), 2) > 0.01)
     studio["#normals"].click()
     studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
+    studio["#to-look"].click()
+    own = studio.page.get_by_label("the file’s own")
+    assert own.is_checked()
+    studio.page.get_by_label("clay").check()
+    studio.eventually(lambda: share(studio.picture(), 0) < 0.001)
+    own.check()
+    studio.eventually(lambda: share(studio.picture(), 0) > 0.02)
     studio["#fine"].click()
     studio.eventually(lambda: share(studio.picture(), 0) < 0.001)
 

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from pathlib import Path
 
 from tests.service.conftest import ROOT
 
@@ -35,6 +36,19 @@ def test_the_scripts_are_sound_by_their_types() -> None:
 def test_every_module_is_loaded_ahead() -> None:
     """Otherwise a browser would find the imports only one file after the other."""
     page = ROOT / "service" / "page"
-    ahead = set(re.findall(r'rel="modulepreload" href="page/(.+?)"', (page / "index.html").read_text()))
+    links = re.findall(
+        r'rel="modulepreload"( fetchpriority="low")? href="page/(.+?)"', (page / "index.html").read_text()
+    )
     modules = [*(page / "js").rglob("*.js"), *(page / "vendor").rglob("*.js")]
-    assert ahead == {path.relative_to(page).as_posix() for path in modules} - {"js/start.js"}
+    assert sorted(path for _, path in links) == sorted(path.relative_to(page).as_posix() for path in modules)
+    # What the first requests need comes first.
+    first = _imported(page / "js" / "server" / "first.js")
+    assert {page / path for later, path in links if not later} == first
+
+
+def _imported(script: Path) -> set[Path]:
+    """A script, and all scripts that it imports."""
+    found = {script}
+    for name in re.findall(r'^import .*"(\..+?)";$', script.read_text(), re.MULTILINE):
+        found |= _imported((script.parent / name).resolve())
+    return found

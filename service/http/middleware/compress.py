@@ -12,8 +12,8 @@ from shapespace.service.http.middleware.base import HTTPMiddleware
 
 #: Binary formats: floating-point numbers that gzip makes hardly smaller, and archives.
 BINARY = (
-    "application/octet-stream", "application/zip", "image/*", "font/*", "model/gltf-binary", "model/stl",
-    "model/vnd.usdz+zip",
+    "application/octet-stream", "application/zip", "image/png", "image/webp", "font/*", "model/gltf-binary",
+    "model/stl", "model/vnd.usdz+zip",
 )  # fmt: skip
 #: End of the entity tag of a compressed answer.
 SUFFIX = '-gzip"'

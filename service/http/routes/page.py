@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import os
 import re
+import time
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -16,8 +18,10 @@ from starlette.routing import BaseRoute, Mount
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
-from shapespace.service.http.caching import entity_tag
-from shapespace.service.http.dependencies import ServiceDependency
+from shapespace.files.poster import poster
+from shapespace.service.http.caching import CachedAnswer, entity_tag
+from shapespace.service.http.dependencies import Model, ServiceDependency
+from shapespace.service.http.responses import cached_response
 
 FOLDER = Path(__file__).parents[2] / "page"
 
@@ -57,6 +61,18 @@ async def page(request: Request, service: ServiceDependency) -> Response:
     return response
 
 
+@router.get("/poster/{name}.svg")
+async def drawing(service: ServiceDependency, request: Request, model: Model) -> Response:
+    """A drawing of the reference, which the page shows until its scripts have arrived."""
+
+    async def compute() -> tuple[CachedAnswer, dict[str, float]]:
+        began = time.perf_counter()
+        content = await asyncio.to_thread(poster, model.reference)
+        return CachedAnswer(content, {}), {"encode": time.perf_counter() - began}
+
+    return await cached_response(service, request, entity_tag("poster", model.digest), "image/svg+xml", compute)
+
+
 def assets() -> BaseRoute:
     """Return the route of the page's styles and scripts."""
     return Mount("/page", _FILES, name="page")
@@ -64,8 +80,10 @@ def assets() -> BaseRoute:
 
 @cache
 def _policy() -> str:
-    """Return the content security policy: files of this server only, and the inline import map by its digest."""
-    maps = re.findall(r'<script type="importmap">(.*?)</script>', (FOLDER / "index.html").read_text("utf-8"), re.DOTALL)
-    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in maps)
+    """Return the content security policy: files of this server only, and the inline scripts by their digests."""
+    inline = re.findall(
+        r"<script(?: type=\"importmap\")?>(.*?)</script>", (FOLDER / "index.html").read_text("utf-8"), re.DOTALL
+    )
+    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
     scripts = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])
     return f"default-src 'self'; script-src {scripts}; object-src 'none'; base-uri 'none'"

@@ -1,10 +1,13 @@
 /** Reads and writes the state of the page in the part of its address after the #. */
 
 import { Matrix4, Quaternion, Vector3 } from "three";
+import { codeIn } from "./server/space.js";
 import { OTHER } from "./view/colouring.js";
 
 const COLOURS = ["stretch", "bending", "distance"];
 const FLAGS = ["wireframe", "normals", "loop"];
+const MATERIALS = ["own", "clay", "skin", "metal", "matcap"];
+const LIGHTS = ["studio", "soft", "side"];
 const number = (value) => String(Number(value.toFixed(5)));
 const list = (numbers) => numbers.map(number).join(",");
 const unlist = (text) => text.split(",").map(Number);
@@ -14,6 +17,7 @@ export function toHash(store, view) {
   const parts = new URLSearchParams({ model: store.model.name, z: list(store.code) });
   const flags = FLAGS.filter((flag) => store[flag]);
   if (!store.fine) flags.push("coarse");
+  if (!store.ground) flags.push("bare");
   if (flags.length) parts.set("show", flags.join(","));
   if (store.locked.some(Boolean))
     parts.set("locked", store.locked.flatMap((is, k) => (is ? [k] : [])).join(","));
@@ -22,6 +26,8 @@ export function toHash(store, view) {
   if (store.seconds) parts.set("seconds", number(store.seconds));
   if (store.easing !== "even") parts.set("easing", store.easing);
   if (COLOURS.includes(store.colour)) parts.set("colour", store.colour);
+  if (store.material !== "own" || store.light !== "studio")
+    parts.set("look", `${store.material},${store.light}`);
   if (store.other) parts.set("other", list(store.other));
   if (store.against !== -1) parts.set("against", store.against);
   if (store.pins.length) parts.set("pins", store.pins.map(fromPin).join(";"));
@@ -65,21 +71,24 @@ export function fromHash(hash, models) {
   const model = models.find(({ name }) => name === parts.get("model"));
   if (!model) return { missing: parts.get("model") };
   const m = model.latent_dimension;
-  const isCode = (code) => code.length === m && code.every(Number.isFinite);
-  const code = unlist(parts.get("z") ?? "");
-  const keyframes = (parts.get("keys") ?? "").split(";").map(unlist).filter(isCode);
+  const keyframes = (parts.get("keys") ?? "").split(";").flatMap((text) => {
+    const code = codeIn(text, m);
+    return code ? [code] : [];
+  });
   const flags = (parts.get("show") ?? "").split(",");
   const locked = (parts.get("locked") ?? "").split(",").filter(Boolean).map(Number);
   const against = Number(parts.get("against") ?? -1);
-  const other = unlist(parts.get("other") ?? "");
-  const isThere = against === OTHER ? isCode(other) : Number.isInteger(against) && against < keyframes.length;
+  const other = codeIn(parts.get("other"), m);
+  const isThere =
+    against === OTHER ? Boolean(other) : Number.isInteger(against) && against < keyframes.length;
   const view = unlist(parts.get("view") ?? "");
   const beyond = Number(parts.get("beyond"));
   const seconds = Number(parts.get("seconds"));
   const colour = parts.get("colour");
+  const [material, light] = (parts.get("look") ?? "").split(",");
   return {
     model,
-    code: isCode(code) ? code : null,
+    code: codeIn(parts.get("z"), m),
     keyframes,
     locked: Array.from({ length: m }, (_, k) => locked.includes(k)),
     pins: (parts.get("pins") ?? "").split(";").flatMap(toPin),
@@ -88,9 +97,12 @@ export function fromHash(hash, models) {
       placement: toPlacement(unlist(parts.get("place") ?? "")),
       ...Object.fromEntries(FLAGS.map((flag) => [flag, flags.includes(flag)])),
       fine: !flags.includes("coarse"),
+      ground: !flags.includes("bare"),
+      material: MATERIALS.includes(material) ? material : "own",
+      light: LIGHTS.includes(light) ? light : "studio",
       colour: COLOURS.includes(colour) ? colour : "none",
       against: isThere ? Math.max(against, OTHER) : -1,
-      other: isCode(other) ? other : null,
+      other,
       seconds: seconds >= 0.5 && seconds <= 120 ? seconds : null,
       easing: parts.get("easing") === "soft" ? "soft" : "even",
       beyond: beyond > 0 && beyond <= 1 ? beyond : 0,

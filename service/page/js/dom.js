@@ -12,6 +12,12 @@ export const element = (name, properties = {}, ...children) => {
 /** Format a number with its meaningful digits. */
 export const readable = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
 
+/** Format a share as percent. One below the whole never reads 100. */
+export function almost(share) {
+  const texts = [2, 3, 4, 5].map((digits) => (100 * share).toFixed(digits));
+  return share < 1 ? (texts.find((text) => Number(text) < 100) ?? "99.99999") : texts[0].replace(".00", "");
+}
+
 /** Return the value below which a share of some numbers lies. */
 export const percentile = (values, share) => values.toSorted()[Math.floor(share * (values.length - 1))];
 

@@ -6,18 +6,21 @@ import { Hand } from "./hand.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
 import { report, reporting, say } from "./messages.js";
+import { sheet } from "./sheet.js";
 import { Store } from "./store.js";
 import { tabs } from "./tabs.js";
+import { theme } from "./theme.js";
 import { Path } from "./path/path.js";
 import { Strip } from "./path/strip.js";
 import { Ghost } from "./scan/ghost.js";
 import { Reader } from "./scan/reader.js";
 import * as api from "./server/api.js";
+import { listed, preferred } from "./server/first.js";
 import { ShapeLoop } from "./server/shape-loop.js";
 import { LatentSpace, sameCode } from "./server/space.js";
 import { openCard } from "./shape/card.js";
-import { inShort, inWords } from "./shape/diagnostics.js";
 import { Names, namesOf } from "./shape/names.js";
+import { OnScreen } from "./shape/on-screen.js";
 import { Pins } from "./shape/pins.js";
 import { Pull } from "./shape/pull.js";
 import { Sliders } from "./shape/sliders.js";
@@ -27,13 +30,14 @@ import { Shelf } from "./shelf/shelf.js";
 import { copy, Files } from "./show/files.js";
 import { Welcome } from "./show/welcome.js";
 import { Colouring } from "./view/colouring.js";
+import { Look } from "./view/look.js";
 import { Modes } from "./view/modes.js";
 import { Pictures } from "./view/pictures.js";
 import { Pose } from "./view/pose.js";
 import { Skin } from "./view/skin.js";
 import { Viewer } from "./view/viewer.js";
 
-const PREFERRED = "figure";
+document.documentElement.classList.add("arrived");
 
 /** @type {import("./store.js").Page} */
 const store = /** @type {any} */ (
@@ -50,6 +54,7 @@ const store = /** @type {any} */ (
     moving: false,
     playing: false,
     shape: null,
+    failed: null,
     keyframes: [],
     loop: false,
     beyond: 0,
@@ -62,11 +67,18 @@ const store = /** @type {any} */ (
     highlight: null,
     regions: null,
     repaint: null,
+    motions: null,
+    material: "own",
+    hasOwn: false,
+    light: "studio",
+    ground: true,
     wireframe: false,
     normals: false,
     fine: true,
     pull: false,
     pins: [],
+    hover: null,
+    solving: null,
     scan: null,
     found: null,
     ghost: true,
@@ -107,10 +119,18 @@ new Reader(store, {
   ownScale: find("#own-scale"),
   stage: find(".stage"),
 });
-new Pins(store, viewer, new Pull(store, viewer), { layer: find("#pins"), clear: find("#clear-pins") });
+new Pins(store, viewer, new Pull(store, viewer), {
+  layer: find("#pins"),
+  threads: find("#threads"),
+  hover: find("#hover"),
+  clear: find("#clear-pins"),
+});
 new ShapeLoop(store);
+new OnScreen(store, find(".stage"));
 const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
+sheet(find("#sheet"), find("main"));
+new Look(store, viewer, find(".stage"));
 
 // The shape and its colours.
 store.on(["shape"], () => {
@@ -123,16 +143,16 @@ store.on(["shape"], () => {
     placement ? placement.clone().multiply(motion) : motion,
   );
 });
-store.on(["colour", "against", "highlight", "regions", "repaint", "moving"], () => {
+store.on(["wireframe", "normals", "material", "colour"], () => viewer.style(store));
+store.on(["colour", "against", "highlight", "regions", "repaint", "material"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
 });
-store.on(["wireframe", "normals"], () => viewer.style(store));
 
-// Diagnostics of the shape.
+// What is drawn, and how long it took.
 let timed = null;
-let told = {}; // diagnostics of the last full shape
 viewer.canvas.addEventListener("drawn", () => {
   const { shape } = store;
+  find("#reset-view").hidden = !viewer.turned;
   if (!shape || shape === timed) return;
   timed = shape;
   const took = performance.now() - shape.began;
@@ -140,21 +160,11 @@ viewer.canvas.addEventListener("drawn", () => {
   find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
   Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
-store.on(["shape", "usual"], () => {
-  if (store.shape?.diagnostics) told = store.shape.diagnostics;
-  const words = inWords(told, store.usual);
-  const { how, line } = inShort(words);
-  find("#diagnostics").className = how;
-  find("#diagnostics summary").textContent = line;
-  find("#diagnostics ul").replaceChildren(
-    ...words.map(([is, , textContent]) => element("li", { className: is, textContent })),
-  );
-});
-
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => {
   viewer.resetView();
+  viewer.canvas.focus(); // the button goes
   remember();
 });
 /** @type {NodeListOf<any>} */
@@ -171,19 +181,7 @@ store.on(["found", "code"], () => {
   find("#sure").hidden = !isShown;
   if (!isShown && colour === "spread") store.set({ colour: "none" });
 });
-const root = document.documentElement;
-const theme = always.kept("theme");
-if (theme) root.dataset.theme = theme;
-viewer.recolour();
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => viewer.recolour());
-find("#theme").addEventListener("click", () => {
-  const dark = root.dataset.theme
-    ? root.dataset.theme === "dark"
-    : matchMedia("(prefers-color-scheme: dark)").matches;
-  root.dataset.theme = dark ? "light" : "dark";
-  always.keep("theme", root.dataset.theme);
-  viewer.recolour();
-});
+theme(find("#theme"), viewer);
 
 // Codes that do not come from the sliders.
 const take = (code) => {
@@ -191,11 +189,15 @@ const take = (code) => {
   store.set({ code: space.wrapAll(code).map((value, k) => (locked[k] ? store.code[k] : value)) });
 };
 const seed = find("#seed");
+const distribution = find("#distribution");
 seed.value = here.kept("seed") ?? 0;
+distribution.value = here.kept("distribution") ?? "population";
 const draw = reporting(async () => {
   here.keep("seed", seed.value);
-  take(await api.sample(store.model, Number(seed.value)));
+  here.keep("distribution", distribution.value);
+  take(await api.sample(store.model, Number(seed.value), distribution.value));
 });
+distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {
   seed.value = Number(seed.value) + 1;
   draw();
@@ -203,7 +205,6 @@ find("#random").addEventListener("click", () => {
 seed.addEventListener("change", () => {
   if (seed.validity.valid && seed.value !== "") draw();
 });
-find("#reset-all").addEventListener("click", () => take(store.space.home));
 find("#draw-strip").addEventListener(
   "click",
   reporting(() => strip.draw()),
@@ -253,11 +254,13 @@ function goTo({ code, keyframes, locked, view, pins, state }) {
  */
 async function openModel({ model, code, keyframes = [], locked, view, pins = [], state = {} }) {
   const space = new LatentSpace(model);
+  const wrapped = space.wrapAll(code ?? space.home);
+  if (store.model) api.ask(model, wrapped); // the first model's answers are under way
   opening = model;
   const coarse = await api.reference(model, "coarse");
   if (opening !== model) return;
   picker.value = model.name;
-  store.set({ shape: null, playing: false, placement: null, pins: [] });
+  store.set({ shape: null, playing: false, placement: null, pins: [], hover: null });
   viewer.open(coarse);
   pictures.open(coarse);
   if (view) Object.assign(viewer, { view, turned: true });
@@ -265,13 +268,14 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     model,
     space,
     names: namesOf(model),
+    hasOwn: false,
     references: { coarse },
     hasFine: false,
     pose: null,
     regions: null,
     usual: null,
     highlight: null,
-    code: space.wrapAll(code ?? space.home),
+    code: wrapped,
     locked: locked ?? space.home.map(() => false),
     keyframes,
     against: -1,
@@ -298,7 +302,10 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
     try {
       const skin = await Skin.of(await api.textured(model));
       if (store.model !== model) skin.dispose();
-      else viewer.dress(store.hasFine ? "fine" : "coarse", skin);
+      else {
+        viewer.dress(store.hasFine ? "fine" : "coarse", skin);
+        store.set({ hasOwn: true });
+      }
     } catch (error) {
       // only the appearance is missing without it
       report(error);
@@ -342,6 +349,9 @@ store.on(
     "other",
     "wireframe",
     "normals",
+    "material",
+    "light",
+    "ground",
     "fine",
     "moving",
     "playing",
@@ -359,7 +369,7 @@ async function restore() {
   if (!asked.code && !embedded) welcome.open();
   if (asked.model && asked.model === store.model) return goTo(asked);
   if (asked.model) return openModel(asked);
-  const model = models.find(({ name }) => name === PREFERRED) ?? models[0];
+  const model = preferred(models);
   if (asked.missing) {
     const instead =
       `The address asks for the model ${asked.missing}, which is not served here. ` +
@@ -375,7 +385,7 @@ find("#key form").addEventListener("submit", () => {
 });
 
 try {
-  models = await api.models();
+  models = await listed;
   picker.replaceChildren(
     ...models.map(({ name, title }) => element("option", { value: name, textContent: title })),
   );
@@ -383,6 +393,7 @@ try {
     throw new Error("No model is served. Put a bundle into the models folder and start again.");
   await restore();
 } catch (error) {
+  find(".stage").ariaBusy = "false";
   if (error.status === 401) find("#key").showModal();
   else report(error);
 }

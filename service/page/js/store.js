@@ -8,14 +8,15 @@
  * @property {Float32Array} positions 3V numbers
  * @property {import("three").Matrix4 | null} placement motion by a pull
  * @property {import("three").Matrix4} motion from the server's position to the shown one
- * @property {object | null} diagnostics of full shapes
+ * @property {object | null} diagnostics null for frames of a path
  * @property {"draft" | "full"} [quality]
  * @property {number} began time of the request
  *
  * @typedef {object} State
  * @property {any} model as the server lists it
  * @property {import("./server/space.js").LatentSpace | null} space
- * @property {{factors: string[], labels: string[], coordinates: string[]} | null} names
+ * @property {Names | null} names
+ * @property {import("./shape/motions.js").Motion[] | null} motions by coordinate, once they are computed
  * @property {{coarse?: Reference, fine?: Reference}} references
  * @property {boolean} hasFine
  * @property {import("./view/pose.js").Pose | null} pose if there is a fine mesh
@@ -25,6 +26,7 @@
  * @property {boolean} moving whether the user moves something; all changes meanwhile are one step
  * @property {boolean} playing
  * @property {Shape | null} shape
+ * @property {number[] | null} failed the last code that has no shape
  * @property {number[][]} keyframes
  * @property {boolean} loop
  * @property {number} beyond share of the path that is played before its start and after its end
@@ -37,14 +39,26 @@
  * @property {number | null} highlight index of the factor under the pointer
  * @property {Float32Array[] | null} regions weights of each factor at coarse vertices
  * @property {object | null} repaint a new object when colours must be computed again
+ * @property {string} material "clay", "skin", "metal", "matcap" or "own"
+ * @property {boolean} hasOwn whether the file's own material is there
+ * @property {string} light "studio", "soft" or "side"
+ * @property {boolean} ground
  * @property {boolean} wireframe
  * @property {boolean} normals
  * @property {boolean} fine
  * @property {boolean} pull
  * @property {import("./shape/pull.js").Pin[]} pins
+ * @property {number | null} hover the vertex that a press would pull
+ * @property {number | null} solving the vertex of the pin that the server is moving
  * @property {any} scan
  * @property {{code: number[], covariance: number[][]} | null} found the shape of a file
  * @property {boolean} ghost
+ *
+ * @typedef {object} Names
+ * @property {string[]} factors
+ * @property {string[]} labels of coordinates, shown below the factor's name
+ * @property {string[]} coordinates full names
+ * @property {import("./shape/motions.js").Motion[]} ends by coordinate, null where it has a name
  *
  * @typedef {{vertices: Float32Array, faces: Int32Array}} Reference
  * @typedef {Store & State} Page the store that all parts of the page use

@@ -246,6 +246,19 @@ def test_work_ends_when_nobody_waits_for_it(narrow: Server) -> None:
     assert "Traceback" not in narrow.log
 
 
+def test_an_animation_has_the_name_that_is_asked_for(client: httpx.Client) -> None:
+    plain, named = (create(client, keyframes=[A, B], frames=5, **name) for name in ({}, {"name": "Wave, left"}))
+    assert plain["id"] != named["id"]
+    glb = GLB(client.get(named["links"]["glb"]).raise_for_status().content)
+    assert [animation["name"] for animation in glb.tree["animations"]] == ["Wave, left"]
+    glb = GLB(client.get(plain["links"]["glb"]).raise_for_status().content)
+    assert [animation["name"] for animation in glb.tree["animations"]] == ["animation"]
+    np.testing.assert_array_equal(frame(client, plain["id"], 2), frame(client, named["id"], 2))
+    for name in ("", "x" * 61):
+        body = {"keyframes": [A, B], "name": name}
+        assert client.post("/v1/models/small/interpolations", json=body).status_code == 422
+
+
 def test_frames_a_second_are_those_that_are_asked_for(client: httpx.Client, tmp_path: Path) -> None:
     from pxr import Usd
 

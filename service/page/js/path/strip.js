@@ -4,7 +4,7 @@ import * as api from "../server/api.js";
 import { element, find, sharp } from "../dom.js";
 
 const COLUMNS = 5;
-const PICTURE = 56;
+const PICTURE = 72;
 
 export class Strip {
   /** @param {import("../store.js").Page} store */
@@ -28,18 +28,19 @@ export class Strip {
     );
     const rows = [["all factors", null], ...model.factors.map((factor, j) => [names.factors[j], factor])];
     find("thead tr", this.table).replaceChildren(
-      element("td"),
       ...t.map((time) => element("th", { scope: "col", textContent: time.toFixed(2) })),
     );
+    // Each name stands above its pictures, which have the whole width.
     const made = rows.map(([name]) =>
       element(
-        "tr",
+        "tbody",
         {},
-        element("th", { scope: "row", textContent: name }),
-        ...t.map(() => element("td", {}, sharp(element("canvas"), PICTURE))),
+        element("tr", {}, element("th", { scope: "rowgroup", colSpan: COLUMNS, textContent: name })),
+        element("tr", {}, ...t.map(() => element("td", {}, sharp(element("canvas"), PICTURE)))),
       ),
     );
-    find("tbody", this.table).replaceChildren(...made);
+    for (const body of [...this.table.tBodies]) body.remove();
+    this.table.append(...made);
     this.table.hidden = false;
     for (const [i, [, factor]] of rows.entries()) {
       const alone = factor ? codes.map((code) => space.alone(factor, code)) : codes;

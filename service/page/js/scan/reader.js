@@ -7,6 +7,7 @@ import * as api from "../server/api.js";
 import { find, readable } from "../dom.js";
 import { report, say } from "../messages.js";
 import { diagonalOf } from "../view/scene.js";
+import { TEXTS } from "../server/problems.js";
 import { fixedBy, sameCode } from "../server/space.js";
 import { encodeInWords, fitInWords } from "./words.js";
 import { Verdict } from "./verdict.js";
@@ -21,6 +22,7 @@ export class Reader {
   /** @param {import("../store.js").Page} store */
   constructor(store, { box, input, readAs, ownScale, stage }) {
     this.store = store;
+    this.formats = input.accept.split(",");
     this.readAs = readAs;
     this.ownScale = ownScale;
     this.verdict = new Verdict(box, () => this.#leave());
@@ -58,16 +60,22 @@ export class Reader {
     const { model, locked } = this.store;
     const refuse = (why) => say(why, { kind: "error", key: "scan" });
     if (!model) {
-      refuse("No model is there yet. Drop the file again when its shape is shown.");
+      refuse("No model is loaded yet. Drop the file again when you see a shape.");
     } else if (locked.every(Boolean)) {
-      refuse("All coordinates are locked. Unlock those that may change, then choose the file again.");
+      refuse("All coordinates are locked. Unlock at least one, then choose the file again.");
     } else if (
       this.readAs.value === "auto" &&
       !this.ownScale.checked &&
-      !POINTS_ONLY.includes(formatOf(file))
+      !POINTS_ONLY.includes(this.#format(file).format)
     ) {
       await this.#encode(file);
     } else await this.#fit(file, this.#asked);
+  }
+
+  /** Return a file's format by a known ending of its name; otherwise the server finds it out. */
+  #format({ name }) {
+    const ending = name.split(".").pop().toLowerCase();
+    return this.formats.includes(`.${ending}`) ? { format: ending } : {};
   }
 
   get #asked() {
@@ -86,11 +94,11 @@ export class Reader {
     const { model, locked, code } = this.store;
     const signal = this.#begin(`Looking for the code of ${file.name} …`);
     try {
-      const answer = await api.encode(model, file, formatOf(file), fixedBy(locked, code), signal);
+      const answer = await api.encode(model, file, this.#format(file), fixedBy(locked, code), signal);
       this.#tell(file, answer, encodeInWords(answer, { file: file.name, ...this.#about }), {});
     } catch (error) {
-      // Other vertices than the model's, or other units: try it as a scan.
-      if (error.type?.endsWith("invalid-mesh")) await this.#fit(file, this.#asked);
+      // Other vertices than the model's, other units, or points alone: try it as a scan.
+      if (/(invalid-mesh|unsupported-media-type)$/.test(error.type)) await this.#fit(file, this.#asked);
       else this.#fail(file, error);
     }
   }
@@ -100,7 +108,7 @@ export class Reader {
     const signal = this.#begin(`Fitting ${model.title} to ${file.name} …`);
     try {
       const options = { ...asked, used: true, fixed: JSON.stringify(fixedBy(locked, code)) };
-      const answer = await api.fit(model, file, formatOf(file), options, signal);
+      const answer = await api.fit(model, file, this.#format(file), options, signal);
       const {
         distances: {
           scan: { p95 },
@@ -111,7 +119,7 @@ export class Reader {
       answer.limit = Math.max(p95, 1e-3 * size * placement.scale);
       this.#tell(file, answer, fitInWords(answer, { file: file.name, ...this.#about }), asked);
     } catch (error) {
-      if (error.message.includes(UNITS)) this.#otherUnits(file, error, asked);
+      if (error.detail?.includes(UNITS)) this.#otherUnits(file, error, asked);
       else this.#fail(file, error);
     }
   }
@@ -136,20 +144,25 @@ export class Reader {
   #fail(file, error) {
     if (error.name === "AbortError") return;
     this.verdict.close();
+    const unknown = !this.#format(file).format && error.type?.endsWith("invalid-mesh");
     if (error.offline) report(error);
+    else if (unknown) say(`${file.name}: ${TEXTS["unsupported-media-type"]}`, { kind: "error", key: "scan" });
     else say(`${file.name}: ${error.message}`, { kind: "error", key: "scan" });
   }
 
   #otherUnits(file, error, asked) {
-    const [, ratio] = error.message.match(/about ([\d.e+-]+) times/) ?? [];
+    const [, ratio] = error.detail.match(/about ([\d.e+-]+) times/) ?? [];
     const words = ratio
       ? `It is about ${readable(Number(ratio))} times as large as the shapes of ${this.#about.model}.`
-      : "Its size is another than that of the model's shapes.";
+      : "Its size differs from the size of the model’s shapes.";
     this.verdict.say(
       {
         how: "fair",
-        title: `${file.name} seems to be in other units`,
-        words: [words, "Nothing was changed. Its shape can be found all the same, with its size."],
+        title: `${file.name} may be in other units`,
+        words: [
+          words,
+          "Your shape stays as it was. The page can find the size of the scan together with its shape.",
+        ],
         more: [],
       },
       [["Fit it with its own scale", () => this.#fit(file, { ...asked, scale: "free" })]],
@@ -211,5 +224,3 @@ export class Reader {
     this.verdict.scale(this.store.scan && own ? `${readable(100 * far, 2)} % of the diagonal or more` : null);
   }
 }
-
-const formatOf = (file) => file.name.split(".").pop().toLowerCase();

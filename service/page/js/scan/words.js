@@ -7,6 +7,7 @@ const percent = (share) => `${readable(100 * share, 2)} %`;
 /** Largest mean distances, as shares of the diagonal, for each verdict on a mesh in correspondence. */
 const GOOD = 0.01;
 const FAIR = 0.03;
+const KEPT = "Your shape stays as it was.";
 
 /**
  * @typedef {object} Verdict
@@ -28,22 +29,20 @@ export function encodeInWords({ residual, vertex_error: error, status, reason },
   const off = error.mean / diagonal;
   const how = status === "poor" || off >= FAIR ? "poor" : off < GOOD ? "good" : "fair";
   const title = {
-    good: `This is the code of ${file}`,
-    fair: `This is the code that comes closest to ${file}`,
-    poor: `${file} is no such shape`,
+    good: `The shape of ${file}`,
+    fair: `The closest shape to ${file}`,
+    poor: `${file} is not a shape of this model`,
   }[how];
   return {
     how,
     title,
     words: [
-      `Its vertices are off by ${percent(off)} of the diagonal on average (${readable(error.mean)} units),` +
-        ` by ${percent(error.max / diagonal)} at most.`,
+      `Mean vertex error: ${percent(off)} of the diagonal (${readable(error.mean)} units). ` +
+        `Largest: ${percent(error.max / diagonal)}.`,
       ...(status === "poor" ? [reason] : []),
-      ...(how === "poor"
-        ? [`${model} has nothing nearer that matches vertex by vertex. Your shape was left as it was.`]
-        : []),
+      ...(how === "poor" ? [`No shape of ${model} is closer, vertex by vertex. ${KEPT}`] : []),
     ],
-    more: [`Lengths and angles are off by ${percent(residual)}.`],
+    more: [`Error of lengths and angles: ${percent(residual)}.`],
   };
 }
 
@@ -66,29 +65,30 @@ export function fitInWords(answer, { file, model, diagonal }) {
   } = answer;
   const size = diagonal * placement.scale; // in the scan's units, like the distances
   const titles = {
-    converged: ["good", `${model} explains ${file}`],
-    ambiguous: ["fair", `${file} fits, but another shape fits nearly as well`],
-    stalled: ["fair", `${file} fits, though the search had not quite come to rest`],
-    poor: ["poor", `${file} is no such shape, or the search went astray`],
-    deadline: ["fair", `The time was over: this is the best fit to ${file} so far`],
+    converged: ["good", `${model} fits ${file}`],
+    ambiguous: ["fair", `${model} fits ${file}, but another shape fits almost as well`],
+    stalled: ["fair", `${model} fits ${file}. The search stopped early`],
+    poor: ["poor", `${file} is not a shape of this model, or the search failed`],
+    deadline: ["fair", `The time limit is reached. This is the best fit to ${file} so far`],
   };
-  const [how, title] = titles[status] ?? ["fair", `The fit of ${file} ended as “${status}”`];
+  const [how, title] = titles[status] ?? ["fair", `The fit to ${file} ended: ${status}`];
   const words = [
-    `Its points lie ${percent(scan.mean / size)} of the diagonal (${readable(scan.mean)} units) from the ` +
-      `shape on average, 95 % of them within ${percent(scan.p95 / size)}.`,
-    `${percent(explained)} of the scan lie at the shape; the scan covers ${percent(seen)} of the shape.`,
+    `Mean distance of the scan from the shape: ${percent(scan.mean / size)} of the diagonal ` +
+      `(${readable(scan.mean)} units). 95 % of the points are closer than ${percent(scan.p95 / size)}.`,
+    `${percent(explained)} of the scan lies on the shape. The scan covers ${percent(seen)} of the shape.`,
   ];
-  if (status === "ambiguous") words.push(`The server says: ${sentence(answer.reason)}`);
+  if (status === "deadline") words.push("For a better fit, use fewer points: a few thousand are enough.");
+  if (status === "ambiguous") words.push(sentence(answer.reason));
   if (typeof mirrored === "number" && mirrored < 0.5) {
-    words.push("Its mirror image fits much better: the sign of one coordinate may be wrong.");
+    words.push("The mirror image fits much better. Perhaps one axis of the file has the wrong sign.");
   }
-  if (how === "poor") words.push("Your shape was left as it was.");
+  if (how === "poor") words.push(KEPT);
   return { how, title, words, more: [place(placement), ...rest(back, size, noise)] };
 }
 
 const rest = (back, size, noise) => [
-  `The shape's vertices lie ${percent(back.mean / size)} of the diagonal from the scan on average.`,
-  `The scan's noise is about ${readable(noise, 2)} units.`,
+  `Mean distance of the shape from the scan: ${percent(back.mean / size)} of the diagonal.`,
+  `The noise of the scan is about ${readable(noise, 2)} units.`,
 ];
 
 /** Return the first sentence of a reason; the others are for programs. */
@@ -99,5 +99,5 @@ function place({ rotation: [[a], [, b], [, , c]], translation, scale }) {
   const to = translation.map((value) => readable(value).replace("-", "−")).join(", ");
   const times =
     Math.abs(scale - 1) < 1e-6 ? "in the model's units" : `${readable(scale)} times the model's size`;
-  return `In the file it is turned by ${angle.toFixed(0)}°, moved by (${to}), ${times}.`;
+  return `The file has it turned by ${angle.toFixed(0)}°, moved by (${to}), ${times}.`;
 }

@@ -4,17 +4,24 @@
 
 import { here } from "../memory.js";
 import { readNpz } from "./npz.js";
+import { inWords } from "./problems.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
 const PATIENCE = 3;
 const KEY = "shapespace-key";
 
-/** A problem by RFC 9457; status 0 means that the server did not answer. */
+/** A problem in the page's words; status 0 means that the server did not answer. */
 export class Problem extends Error {
-  constructor(message, status, type) {
+  /**
+   * @param {string} message
+   * @param {number} status
+   * @param {{type?: string, detail?: string}} [said] the server's problem (RFC 9457)
+   */
+  constructor(message, status, { type = "", detail = "" } = {}) {
     super(message);
     this.status = status;
     this.type = type;
+    this.detail = detail;
   }
 
   get offline() {
@@ -48,11 +55,7 @@ async function call(path, options = {}) {
       continue;
     }
     const problem = await response.json().catch(() => ({}));
-    throw new Problem(
-      problem.detail ?? `The server answers ${response.status}.`,
-      response.status,
-      problem.type,
-    );
+    throw new Problem(inWords(problem, response.status), response.status, problem);
   }
 }
 
@@ -65,12 +68,39 @@ const post = (path, body, signal) =>
   });
 const json = async (response) => (await response).json();
 
+/** Answers that were requested before the scripts that want them had arrived; the first call takes each. */
+const early = new Map();
+const taken = (name) => {
+  const answer = early.get(name);
+  early.delete(name);
+  return answer;
+};
+const nameOf = (model, ...what) => [model.name, model.version, ...what].join(" ");
+
+/** Request the coarse reference of a model and the draft of a code, both at once, for later calls. */
+export function ask(model, code) {
+  early.clear();
+  const draft = { quality: /** @type {const} */ ("draft") };
+  const answers = [
+    [nameOf(model, "coarse"), reference(model, "coarse")],
+    [nameOf(model, code, "coarse", "draft"), shapes(model, [code], "coarse", draft)],
+  ];
+  for (const [name, answer] of /** @type {[string, Promise<any>][]} */ (answers)) {
+    answer.catch(() => {}); // the call that takes it reports the error
+    early.set(name, answer);
+  }
+}
+
 /**
  * Return the address of a call of a model, in the version that the page has listed.
  * Codes of another version mean other shapes.
  */
 const at = (model, name, query = {}) =>
   `${model.links.self}${name && "/"}${name}?${new URLSearchParams({ ...query, version: model.version })}`;
+
+/** Return the address of a drawing of the reference, which is there before the page can draw. */
+export const posterOf = (model) =>
+  `${origin}/poster/${model.name}.svg?${new URLSearchParams({ version: model.version })}`;
 
 export const models = async () => (await json(call("/v1/models"))).models;
 export const modelCard = (model) => json(call(at(model, "")));
@@ -84,6 +114,8 @@ const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagn
 
 /** Return positions and faces of the reference. */
 export async function reference(model, mesh) {
+  const asked = taken(nameOf(model, mesh));
+  if (asked) return asked;
   const response = await call(at(model, "mesh", { mesh, format: "npz" }));
   const { vertices, faces } = await readNpz(await response.arrayBuffer(), ["vertices", "faces"]);
   return { vertices: vertices.data, faces: faces.data };
@@ -100,6 +132,8 @@ export const textured = async (model) => (await call(at(model, "mesh", { format:
  * @param {{quality?: "draft" | "full", signal?: AbortSignal}} [options]
  */
 export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
+  const asked = taken(nameOf(model, latents, mesh, quality));
+  if (asked) return asked;
   const body = { latents, mesh, quality, faces: false };
   const response = await post(at(model, "vertices", { format: "npz" }), body, signal);
   const { vertices } = await readNpz(await response.arrayBuffer(), ["vertices"]);
@@ -109,9 +143,9 @@ export async function shapes(model, latents, mesh, { quality = "full", signal } 
 /** Return the id and links of an animation. */
 export const interpolation = (model, path) => json(post(at(model, "interpolations"), path));
 
-/** Return the random code of a seed. */
-export async function sample(model, seed) {
-  const { latents } = await json(post(at(model, "sample"), { count: 1, seed, distribution: "uniform" }));
+/** Return the random code of a seed, from the population or uniform inside the bounds. */
+export async function sample(model, seed, distribution) {
+  const { latents } = await json(post(at(model, "sample"), { count: 1, seed, distribution }));
   return latents[0];
 }
 
@@ -120,7 +154,7 @@ export const edit = (model, body, signal) => json(post(at(model, "edit"), body, 
 
 /** Return the code of a mesh file, with some fixed coordinates. */
 export const encode = (model, file, format, fixed, signal) => {
-  const path = at(model, "encode", { format, fixed: JSON.stringify(fixed) });
+  const path = at(model, "encode", { ...format, fixed: JSON.stringify(fixed) });
   return json(call(path, { method: "POST", body: file, signal }));
 };
 
@@ -136,9 +170,17 @@ export async function spread(model, { code, covariance }, mesh) {
 
 /** Fit a scan: return its code and placement. */
 export const fit = (model, file, format, options, signal) => {
-  const path = at(model, "fit", { format, ...options });
+  const path = at(model, "fit", { ...format, ...options });
   return json(call(path, { method: "POST", body: file, signal }));
 };
+
+/** Return whether a link without a key can have shapes as USDZ, for which the server needs a package. */
+export const writesUsdz = async (model) =>
+  !here.kept(KEY) &&
+  call(at(model, "mesh", { format: "usdz", mesh: "coarse" })).then(
+    () => true,
+    () => false,
+  );
 
 /** Return a file to save, as a blob. */
 export const file = async (path, body) => (await (body ? post(path, body) : call(path))).blob();

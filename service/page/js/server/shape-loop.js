@@ -103,14 +103,16 @@ export class ShapeLoop {
         const { quality } = diagnostics;
         if (model === this.store.model && !this.store.playing) {
           const motion = motionOf(this.store, mesh, code, shapes[0]);
-          const told = quality === "full" ? diagnostics : null;
-          await this.#show({ ...asked, quality, positions: shapes[0], motion, diagnostics: told });
+          await this.#show({ ...asked, quality, positions: shapes[0], motion, diagnostics });
         }
         if (quality === "draft") this.#rest();
       } catch (error) {
         if (error.offline) await this.#untilReady(asked);
         else {
-          if (error.name !== "AbortError") clearTimeout(this.#timer); // the full shape would fail too
+          if (error.name !== "AbortError") {
+            clearTimeout(this.#timer); // the full shape would fail too
+            this.store.set({ failed: asked.code });
+          }
           report(error);
         }
       }

@@ -31,10 +31,10 @@ export class LatentSpace {
     return [this.lower[k] - beyond, this.upper[k] + beyond];
   }
 
-  /** Return the values of a coordinate's three pictures: near the lower bound, home, near the upper bound. */
-  stations(k) {
-    if (!this.period[k]) return [this.lower[k], this.home[k], this.upper[k]];
-    return [-0.25, 0, 0.25].map((turn) => this.wrap(k, this.home[k] + turn * this.period[k]));
+  /** Return the values of a coordinate's two pictures: its bounds, or a quarter of a period on each side. */
+  ends(k) {
+    if (!this.period[k]) return [this.lower[k], this.upper[k]];
+    return [-0.25, 0.25].map((turn) => this.wrap(k, this.home[k] + turn * this.period[k]));
   }
 
   inside(k, value) {
@@ -88,3 +88,9 @@ export const sameCode = (a, b) =>
 /** Return the locked coordinates of a code as the server's `fixed`. */
 export const fixedBy = (locked, code) =>
   Object.fromEntries(code.map((value, k) => [k, value]).filter(([k]) => locked[k]));
+
+/** Return the code of `m` numbers that a text lists, or null. */
+export function codeIn(text, m) {
+  const code = (text ?? "").split(",").map(Number);
+  return code.length === m && code.every(Number.isFinite) ? code : null;
+}

@@ -1,84 +1,90 @@
-/** The card of a model: its description, its measured figures, and example calls. */
+/** The card of a model: its description, and how good it is, in sentences, bars and a table. */
 
 import * as api from "../server/api.js";
-import { element, find, readable } from "../dom.js";
+import { almost, element, find, readable } from "../dom.js";
 
-const rows = (facts) =>
-  facts.map(([name, value, meaning = ""]) =>
-    element(
-      "div",
-      {},
-      element("dt", { textContent: name }),
-      element("dd", { textContent: value }),
-      ...(meaning ? [element("dd", { className: "hint", textContent: meaning })] : []),
-    ),
-  );
-const percent = (share) => `${readable(100 * share)} %`;
+const percent = (share) => `${readable(100 * share)}\u00a0%`;
 
-/** Explanations of the figures. */
-const MEANINGS = {
-  r2: "How much of the change of lengths and angles the networks get right: 1 is all of it.",
-  unseen: "From shapes that training has not seen, in shares of the diagonal.",
-  components: "The same by a linear model with as many numbers.",
-  random: "From random shapes to the nearest of training, in shares of the diagonal: how far they stray.",
-  draft: "From what is shown while something moves to the full shape.",
-  error: "From the networks’ shapes to exact ones, in shares of the diagonal.",
+/** Rows of the table, named as in a run's report; the card as JSON has figures without a name here. */
+const ROWS = {
+  composite: "This model",
+  monolithic: "The same recipe with one factor",
+  kernel: "Kernel ridge regression on the codes",
+  monolithic_paper: "The paper’s monolithic network",
+  paper: "The paper’s composite network",
+  affine: "Affine sum of exact factors",
+  "affine of learned factors": "Affine sum of learned factors",
 };
 
-/** Return the numbers of a nested object with their paths, such as ["r2 composite total", 0.99]. */
-function flatten(value, path = []) {
-  if (typeof value === "number") return [[path.join(" ").replaceAll("_", " "), value]];
-  if (value === null || typeof value !== "object") return [];
-  return Object.entries(value).flatMap(([key, inner]) => flatten(inner, [...path, key]));
+/** Return what the figures mean, as sentences. */
+function sentences(card) {
+  const { latent_dimension: m, factors, vertices, faces, specificity: random, draft_error: draft } = card;
+  const { r2, vertex_error: error } = card.figures;
+  const parts = factors.length === 1 ? "one factor" : `${factors.length} factors`;
+  return [
+    `A code has ${m} ${m === 1 ? "number" : "numbers"} in ${parts}. Each shape has ${vertices} vertices and ` +
+      `${faces} faces.`,
+    r2?.composite &&
+      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of lengths and ` +
+        "angles.",
+    error?.mean &&
+      `Their vertices are off by ${percent(error.mean)} of the shape’s diagonal on average, compared with ` +
+        "exact shapes.",
+    draft && `While something moves, the page shows drafts, which are off by ${percent(draft.mean)}.`,
+    random &&
+      `A random shape is ${percent(random.modes)} of the diagonal away from the nearest training shape. ` +
+        `With as many principal components, it is ${percent(random.components)}.`,
+  ].filter(Boolean);
+}
+
+/** Return a bar for each value, as long as its share of the largest. */
+function bars(values) {
+  const most = Math.max(...values.map(([, value]) => value));
+  return values.flatMap(([name, value]) => {
+    const bar = element(
+      "dd",
+      {},
+      element("span", { className: "bar" }),
+      element("span", { textContent: percent(value) }),
+    );
+    bar.style.setProperty("--share", String(value / most));
+    return [element("dt", { textContent: name }), bar];
+  });
 }
 
 export async function openCard(dialog, model) {
   const card = await api.modelCard(model);
-  const { r2, vertex_error: error } = card.figures;
-  const { generalisation: unseen, specificity: random, draft_error: draft } = card;
+  const { generalisation: unseen, figures } = card;
   find("h2", dialog).textContent = card.title;
   find(".kind", dialog).textContent = `${card.name} · version ${card.version} · ${card.licence}`;
   find(".description", dialog).textContent = card.description;
-  find(".facts", dialog).replaceChildren(
-    ...rows([
-      ["coordinates", card.latent_dimension],
-      ["factors", card.factors.length],
-      ["vertices", card.vertices],
-      ["faces", card.faces],
-      ...(r2?.composite ? [["variance explained (R²)", readable(r2.composite.total, 4), MEANINGS.r2]] : []),
-      ...(unseen
-        ? [
-            ["unseen shapes, mean distance", percent(unseen.mean), MEANINGS.unseen],
-            ["as many principal components", percent(unseen.components.mean), MEANINGS.components],
-          ]
-        : []),
-      ...(random
-        ? [
-            ["random shapes, to the nearest trained on", percent(random.modes), MEANINGS.random],
-            ["of as many principal components", percent(random.components), MEANINGS.components],
-          ]
-        : []),
-      ...(draft ? [["drafts, mean distance", percent(draft.mean), MEANINGS.draft]] : []),
-      ...(error?.mean ? [["mean vertex error", percent(error.mean), MEANINGS.error]] : []),
-    ]),
+  find(".sentences", dialog).replaceChildren(
+    ...sentences(card).map((textContent) => element("p", { textContent })),
   );
-  const cells = (...texts) => texts.map((textContent) => element("td", { textContent }));
+  find(".unseen", dialog).hidden = !unseen;
+  if (unseen) {
+    find(".unseen dl", dialog).replaceChildren(
+      ...bars([
+        ["This model", unseen.mean],
+        ["Principal components", unseen.components.mean],
+      ]),
+    );
+  }
+  const rows = Object.entries(figures.r2 ?? {}).filter(([name]) => name in ROWS);
+  const cell = (value) =>
+    element("td", { textContent: value === undefined ? "" : `${almost(value)}\u00a0%` });
   find(".compared tbody", dialog).replaceChildren(
-    ...Object.entries(r2 ?? {}).map(([name, { total, lengths, angles }]) =>
+    ...rows.map(([name, { total, lengths, angles }]) =>
       element(
         "tr",
         {},
-        element("th", { scope: "row", textContent: name }),
-        ...cells(...[total, lengths, angles].map((value) => (value === undefined ? "" : readable(value, 4)))),
+        element("th", { scope: "row", textContent: ROWS[name] }),
+        ...[total, lengths, angles].map(cell),
       ),
     ),
   );
-  find(".compared", dialog).hidden = !r2;
-  find(".figures tbody", dialog).replaceChildren(
-    ...flatten(card.figures).map(([name, value]) =>
-      element("tr", {}, element("th", { scope: "row", textContent: name }), ...cells(readable(value, 4))),
-    ),
-  );
+  find(".compared", dialog).hidden = rows.length === 0;
+  find(".all", dialog).href = card.links.self;
   find(".digest", dialog).textContent = card.digest;
   dialog.showModal();
 }

@@ -34,11 +34,12 @@ export function inWords(diagnostics, usual) {
   return words;
 }
 
-/** Return the worst level, and one line for all: the faults, or what is good. */
+/** Return the worst level, and one line: the faults if there are any. */
 export function inShort(words) {
   const how = ["poor", "fair"].find((each) => words.some(([is]) => is === each)) ?? "good";
+  if (how === "good") return { how, line: "Looks right" };
   const line = words
-    .filter(([is]) => (is === "good") === (how === "good"))
+    .filter(([is]) => is !== "good")
     .map(([, word]) => word)
     .join(", ");
   return { how, line: line.charAt(0).toUpperCase() + line.slice(1) };

@@ -4,6 +4,7 @@
 
 import { element, find } from "../dom.js";
 import { always } from "../memory.js";
+import { keptMotions } from "./motions.js";
 
 const LONGEST = 60;
 const place = (model) => `names:${model.name}`;
@@ -22,19 +23,23 @@ function own(model) {
  * Return the names to show.
  * @param {object} model as the server lists it
  * @param {Record<string, string>} said the user's names of factors and coordinates
- * @returns {{factors: string[], labels: string[], coordinates: string[]}} labels stand below the
- *   factor's name
+ * @param {import("./motions.js").Motion[]} motions what both ends of each coordinate look like, where known
+ * @returns {import("../store.js").Names}
  */
-export function namesOf(model, said = own(model)) {
+export function namesOf(model, said = own(model), motions = keptMotions(model)) {
   const factors = model.factors.map(({ name }) => said[`factor ${name}`] ?? name);
-  const all = labels(model).map((label, k) => said[`coordinate ${model.latent_names[k]}`] ?? label);
+  const plain = labels(model);
+  const short = plain.map((label, k) => said[`coordinate ${model.latent_names[k]}`] ?? label);
+  // A number says nothing about a coordinate, and a word of the model's author says more than its motion.
+  const ends = short.map((label, k) => (/^\d*$/.test(label) ? motions?.[k] : null) ?? null);
   const coordinates = model.factors.flatMap(({ name, start, stop }, j) =>
-    all.slice(start, stop).map((label, i) => {
-      const same = factors[j] === name && label === labels(model)[start + i];
+    short.slice(start, stop).map((label, i) => {
+      if (ends[start + i]) return `${factors[j]}, ${ends[start + i].join(" to ")}`;
+      const same = factors[j] === name && label === plain[start + i];
       return same ? model.latent_names[start + i] : [factors[j], label].filter(Boolean).join(", ");
     }),
   );
-  return { factors, labels: all, coordinates };
+  return { factors, labels: short.map((label, k) => ends[k]?.join(" ↔ ") ?? label), coordinates, ends };
 }
 
 /** Return the names of coordinates without the name of their factor, which stands above. */
@@ -54,6 +59,10 @@ export class Names {
   constructor(store, { dialog, button }) {
     this.store = store;
     this.dialog = dialog;
+    store.on(["motions"], () => {
+      const { model, motions } = store;
+      if (motions) store.set({ names: namesOf(model, own(model), motions) });
+    });
     button.addEventListener("click", () => this.#open());
     find("form", dialog).addEventListener("submit", () => this.#keep(true));
     find("[data-do=forget]", dialog).addEventListener("click", () => {
@@ -105,6 +114,6 @@ export class Names {
     const typedIn = inputs.map(({ dataset, value }) => [dataset.key, value.trim()]);
     const said = Object.fromEntries(typedIn.filter(([, name]) => name));
     always.keep(place(model), JSON.stringify(said));
-    this.store.set({ names: namesOf(model, said) });
+    this.store.set({ names: namesOf(model, said, this.store.motions ?? undefined) });
   }
 }

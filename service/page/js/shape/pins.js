@@ -1,6 +1,10 @@
-/** The pins of pulls as buttons over the shape: dragging one pulls further, pressing one removes it. */
+/**
+ * The pins of pulls as buttons over the shape: dragging one pulls further, pressing one removes it. A line joins
+ * each pin to its vertex, and a ring marks the vertex under the pointer.
+ */
 
 import { element, find } from "../dom.js";
+import { vertexOf } from "./pull.js";
 
 const STILL = 4; // pixels that the pointer may move during a press
 
@@ -8,13 +12,16 @@ export class Pins {
   #buttons = [];
 
   /** @param {import("../store.js").Page} store */
-  constructor(store, viewer, pull, { layer, clear }) {
+  constructor(store, viewer, pull, { layer, threads, hover, clear }) {
     this.store = store;
     this.viewer = viewer;
     this.pull = pull;
     this.layer = layer;
+    this.threads = threads;
+    this.hover = hover;
     this.clear = clear;
-    store.on(["pins"], () => this.#show());
+    store.on(["pins", "solving"], () => this.#show());
+    store.on(["hover"], () => this.#place());
     viewer.canvas.addEventListener("drawn", () => this.#place());
     clear.addEventListener("click", () => {
       store.set({ pins: [] });
@@ -23,10 +30,13 @@ export class Pins {
   }
 
   #show() {
-    const { pins } = this.store;
+    const { pins, solving } = this.store;
     this.clear.hidden = pins.length === 0;
     while (this.#buttons.length > pins.length) this.#buttons.pop().remove();
     while (this.#buttons.length < pins.length) this.#add(this.#buttons.length);
+    this.#buttons.forEach((button, i) => button.classList.toggle("busy", pins[i].vertex === solving));
+    const line = () => document.createElementNS("http://www.w3.org/2000/svg", "line");
+    this.threads.replaceChildren(...pins.map(line));
     this.viewer.draw();
   }
 
@@ -62,9 +72,20 @@ export class Pins {
   }
 
   #place() {
+    const { pins, hover, shape, references } = this.store;
+    const { picker } = this.viewer;
     this.#buttons.forEach((button, i) => {
-      const { x, y } = this.viewer.project(this.store.pins[i].position);
+      const { x, y } = picker.project(pins[i].position);
       button.style.translate = `${x}px ${y}px`;
+      const line = this.threads.children[i];
+      const vertex = shape && vertexOf(pins[i], shape.mesh, references);
+      const end = shape ? picker.project(picker.at(vertex)) : { x, y };
+      for (const [name, value] of Object.entries({ x1: x, y1: y, x2: end.x, y2: end.y }))
+        line.setAttribute(name, String(value));
     });
+    this.hover.hidden = hover === null || !shape;
+    if (this.hover.hidden) return;
+    const { x, y } = picker.project(picker.at(hover));
+    this.hover.style.translate = `${x}px ${y}px`;
   }
 }

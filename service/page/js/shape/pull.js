@@ -12,6 +12,7 @@ import { diagonalOf } from "../view/scene.js";
 import { fixedBy } from "../server/space.js";
 
 const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it counts as reached
+const REACH = { mouse: 12, touch: 24 }; // pixels beside the shape at which a press still means its nearest vertex
 const NEARER = 0.9; // a code that leaves more than this share of the distance does not change the shape
 
 /**
@@ -33,22 +34,46 @@ export class Pull {
     this.store = store;
     this.viewer = viewer;
     const { canvas } = viewer;
-    store.on(["pull"], () => canvas.classList.toggle("pulling", store.pull));
+    store.on(["pull"], () => {
+      canvas.classList.toggle("pulling", store.pull);
+      store.set({ hover: null });
+    });
     // Before the controls get the event and turn the view.
     canvas.addEventListener("pointerdown", (event) => this.#pick(event), { capture: true });
+    canvas.addEventListener("pointermove", (event) => this.#hover(event));
+    canvas.addEventListener("pointerleave", () => store.set({ hover: null }));
+    // Two quick presses are two pulls, not a wish to see all of the shape.
+    canvas.addEventListener("dblclick", (event) => store.pull && event.stopImmediatePropagation(), {
+      capture: true,
+    });
     addEventListener("pointermove", (event) => this.#drag(event));
     for (const end of ["pointerup", "pointercancel"]) addEventListener(end, (event) => this.#let(event));
   }
 
+  /** Return the vertex that a press at this event would pull, or null. */
+  #meant(event) {
+    if (!this.store.pull || this.store.playing || !this.store.shape) return null;
+    return this.viewer.picker.pick(event, REACH[event.pointerType] ?? REACH.mouse);
+  }
+
+  /** Mark the vertex that a press would pull; a finger hides it, so only for the mouse and the pen. */
+  #hover(event) {
+    if (!this.store.pull || this.#held || event.buttons || event.pointerType === "touch") return;
+    this.store.set({ hover: this.#meant(event)?.vertex ?? null });
+  }
+
   #pick(event) {
-    if (!this.store.pull || event.button !== 0 || this.store.playing || !this.store.shape) return;
-    const hit = this.viewer.pick(event);
+    if (this.#held) event.stopImmediatePropagation(); // a second finger during a pull
+    if (event.button !== 0 || this.#held) return;
+    const hit = this.#meant(event);
     if (!hit) return;
     event.stopImmediatePropagation();
     this.viewer.canvas.setPointerCapture(event.pointerId);
-    const pin = { mesh: this.store.shape.mesh, ...hit };
+    const { pins, shape } = this.store;
+    const there = pins.find(({ mesh, vertex }) => mesh === shape.mesh && vertex === hit.vertex);
+    const pin = there ?? { mesh: shape.mesh, ...hit };
     this.take(pin, event); // first, so that changes during the pull belong to its step in the history
-    this.store.set({ pins: [...this.store.pins, pin] });
+    this.store.set({ pins: there ? pins : [...pins, pin], hover: null });
   }
 
   /** Begin to drag a pin with the pointer of this event. */
@@ -67,7 +92,7 @@ export class Pull {
   #drag(event) {
     if (!this.#held || event.pointerId !== this.#held.pointer) return;
     const { pin } = this.#held;
-    const moved = { ...pin, position: this.viewer.unproject(event, pin.position) };
+    const moved = { ...pin, position: this.viewer.picker.unproject(event, pin.position) };
     this.#held.pin = moved;
     this.store.set({ pins: this.store.pins.map((each) => (each === pin ? moved : each)) });
     this.#wanted = true;
@@ -77,6 +102,7 @@ export class Pull {
   /** Send the newest targets, once the last request is answered. */
   async #solve() {
     this.#busy = true;
+    this.store.set({ solving: this.#last.pin.vertex });
     while (this.#wanted) {
       this.#wanted = false;
       const { before, mesh, motion, there, positions } = this.#last;
@@ -101,6 +127,7 @@ export class Pull {
       }
     }
     this.#busy = false;
+    this.store.set({ solving: null });
     if (!this.#held) this.#done();
   }
 
@@ -109,14 +136,7 @@ export class Pull {
     const back = there.clone().invert();
     const { references } = this.store;
     const found = new Map(
-      pins.map((pin) => {
-        const on = (name) => references[name].vertices;
-        const vertex =
-          pin.mesh === mesh || !references.fine
-            ? pin.vertex
-            : nearest(on(pin.mesh).subarray(3 * pin.vertex, 3 * pin.vertex + 3), on(mesh))[0];
-        return [vertex, pin.position.clone().applyMatrix4(back).toArray()];
-      }),
+      pins.map((pin) => [vertexOf(pin, mesh, references), pin.position.clone().applyMatrix4(back).toArray()]),
     );
     return [...found].map(([vertex, position]) => ({ vertex, position }));
   }
@@ -141,18 +161,26 @@ export class Pull {
     const far = `${readable(100 * Math.max(...shares), 2)} % of the diagonal`;
     takeBack("pull");
     if (missed.length === 0) {
-      say(`The shape has followed: it is ${far} from where you pulled it.`, { key: "pull" });
+      say(`The shape has followed. It is ${far} from the place where you pulled it.`, { key: "pull" });
       return;
     }
     const which =
-      shares.length === 1 ? "The pin was not met" : `${missed.length} of ${shares.length} pins were not met`;
+      shares.length === 1
+        ? "The shape does not reach the pin"
+        : `The shape does not reach ${missed.length} of ${shares.length} pins`;
+    const stays = follows ? "" : " The shape stays as it was.";
     const why = locked.some(Boolean)
       ? "Unlock coordinates that move this place, or pull less."
       : "Pull less, or remove a pin.";
-    say(`${which}: the shape stays ${far} away${follows ? "" : ", and was left as it was"}. ${why}`, {
-      key: "pull",
-    });
+    say(`${which}. The distance is ${far}.${stays} ${why}`, { key: "pull" });
   }
+}
+
+/** Return the vertex of a pin on one of the meshes: its own, or the nearest one. */
+export function vertexOf(pin, mesh, references) {
+  if (pin.mesh === mesh || !references.fine) return pin.vertex;
+  const { vertices } = references[pin.mesh];
+  return nearest(vertices.subarray(3 * pin.vertex, 3 * pin.vertex + 3), references[mesh].vertices)[0];
 }
 
 /** Return the distance of each target from its vertex, given positions (3V numbers). */

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import * as api from "../server/api.js";
 import { report } from "../messages.js";
-import { VIEW, face, geometryOf, move, paint, surfaceMaterial } from "../view/scene.js";
+import { VIEW, geometryOf, move } from "../view/scene.js";
 import { meshOf } from "../server/shape-loop.js";
 
 const APART = 1.1; // distance between the middles, in widths of the reference
@@ -18,16 +18,18 @@ export class Beside {
   constructor(store, viewer) {
     this.store = store;
     this.viewer = viewer;
-    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), surfaceMaterial());
+    this.mesh = new THREE.Mesh();
     this.mesh.frustumCulled = false;
     this.ground = viewer.ground();
     this.#appear(false);
     viewer.scene.add(this.mesh);
     store.on(["other", "model", "fine", "hasFine"], () => this.#fetch());
+    store.on(["ground"], () => this.#appear(this.mesh.visible));
   }
 
   #appear(is) {
-    this.mesh.visible = this.ground.visible = is;
+    this.mesh.visible = is;
+    this.ground.visible = is && this.store.ground;
   }
 
   #fetch() {
@@ -55,12 +57,11 @@ export class Beside {
   }
 
   #show({ faces, vertices }, positions) {
-    const { geometry, material, position } = this.mesh;
+    const { geometry, position } = this.mesh;
     geometry.dispose();
     this.mesh.geometry = geometryOf(faces, vertices.length / 3);
     move(this.mesh.geometry, positions);
-    paint(this.mesh.geometry, null);
-    face(material, this.viewer.side);
+    this.viewer.cover(this.mesh);
     position.copy(SIDEWAYS).multiplyScalar(APART * extent(vertices, SIDEWAYS));
     this.mesh.updateMatrixWorld(true);
     const { center, radius } = this.viewer.sphere;

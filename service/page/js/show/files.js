@@ -6,7 +6,7 @@ import { baseOf } from "../view/colouring.js";
 import { element, find, readable } from "../dom.js";
 import { reporting, say } from "../messages.js";
 import { CODE } from "./code.js";
-import { picture, record, turntable } from "./video.js";
+import { picture, record, turntable, videoFormats } from "./video.js";
 
 /** Formats of one shape. */
 export const SHAPE_FORMATS = ["glb", "gltf", "obj", "ply", "stl", "npz", "zip", "json"];
@@ -45,9 +45,27 @@ export class Files {
     this.language.addEventListener("change", () => this.#tell());
     this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
+    /** @type {NodeListOf<any>} one menu beside each button that records */
+    const menus = document.querySelectorAll(".video-format");
+    this.video = [...menus];
+    for (const menu of this.video) {
+      menu.append(
+        ...videoFormats().map((value) => element("option", { value, textContent: value.toUpperCase() })),
+      );
+      menu.addEventListener("change", () => {
+        for (const each of this.video) each.value = menu.value;
+      });
+    }
+    this.ar = find("#ar", root);
     store.on(["code", "model", "fine", "colour", "against", "keyframes", "other", "placement"], () =>
       this.#tell(),
     );
+    if (this.ar.relList.supports("ar"))
+      store.on(
+        ["model"],
+        reporting(() => this.#offerAR()),
+      );
+    viewer.canvas.addEventListener("turned", () => this.#tell());
     this.format.addEventListener("change", () => this.#tell());
     find("#download", root).addEventListener(
       "click",
@@ -96,9 +114,25 @@ export class Files {
     const {
       model: { name, title },
     } = this.store;
-    const embed = `${api.origin}/?embed${toHash(this.store, null)}`;
+    const view = this.viewer.turned ? this.viewer.view : null;
+    this.ar.href = this.#usdz;
+    const embed = `${api.origin}/?embed${toHash(this.store, view)}`;
     const file = `${name}.${this.format.value}`;
     this.code.textContent = CODE[this.language.value]({ url: api.origin + path, body, file, embed, title });
+  }
+
+  /** Return the address of the shape as USDZ, which phones place in the room. */
+  get #usdz() {
+    const { model, code, fine } = this.store;
+    const query = { latent: rounded(code).join(","), format: "usdz", mesh: fine ? "fine" : "coarse" };
+    return `${api.origin}${model.links.mesh}?${new URLSearchParams({ ...query, version: model.version })}`;
+  }
+
+  /** Offer the shape in the room where the browser can show it and the server writes USDZ. */
+  async #offerAR() {
+    const room = find("#room");
+    room.hidden = true;
+    room.hidden = !(await api.writesUsdz(this.store.model));
   }
 
   async #shape() {
@@ -118,7 +152,7 @@ export class Files {
     if (!validity.valid || value === "") throw new Error("Say how many seconds a turn takes, from 1 to 60.");
     return this.#video("turntable", (tell) => {
       tell(seconds);
-      return turntable(this.viewer, seconds);
+      return turntable(this.viewer, seconds, this.video[0].value);
     });
   }
 
@@ -127,7 +161,7 @@ export class Files {
       const { seconds, show } = await this.path.film();
       tell(seconds);
       try {
-        return await record(this.viewer, seconds, show);
+        return await record(this.viewer, seconds, show, this.video[0].value);
       } finally {
         this.path.pause();
       }
@@ -162,16 +196,18 @@ export class Files {
 
   async #animation() {
     const { model, fine } = this.store;
+    const name = find("#path-name").value.trim();
     say("The server makes the animation …", { key: "animation" });
     try {
       await this.#animationFormats(); // they are missing if the server did not answer
       const format = this.animation.value;
       const { links } = await api.interpolation(model, {
         ...this.path.request,
+        ...(name && { name }),
         mesh: fine ? "fine" : "coarse",
       });
       const speed = TIMED.includes(format) ? `&fps=${Math.max(this.path.fps, 1)}` : "";
-      keep(await api.file(links[format] + speed), `${model.name}-animation.${format}`);
+      keep(await api.file(links[format] + speed), `${name || `${model.name}-animation`}.${format}`);
       say("The animation is saved.", { key: "animation" });
     } catch (error) {
       say(error.message, { kind: "error", key: "animation" });

@@ -1,6 +1,10 @@
 /** Pictures and videos of the stage, as shown. */
 
-const TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
+/** Types of each format, the best first. Phones and slides play MP4 with H.264. @type {Record<string, string[]>} */
+const TYPES = {
+  mp4: ["video/mp4;codecs=avc1.640033", "video/mp4;codecs=avc1.42E01F", "video/mp4"],
+  webm: ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"],
+};
 const FPS = 30;
 const BITS = 8e6; // frames per second
 const REST = 200; // ms at the end, because the last pictures come late
@@ -16,12 +20,19 @@ export function picture(viewer) {
   });
 }
 
+/** Return the type that the browser records in a format, or undefined. */
+const typeOf = (format) =>
+  globalThis.MediaRecorder && TYPES[format]?.find((type) => MediaRecorder.isTypeSupported(type));
+
+/** Return the video formats that the browser records. */
+export const videoFormats = () => Object.keys(TYPES).filter(typeOf);
+
 /**
  * Record a video of the stage, and call `show` with shares (0 … 1) of its time, until it returns false.
  * @returns {Promise<{blob: Blob, extension: string}>}
  */
-export function record(viewer, seconds, show) {
-  const type = globalThis.MediaRecorder && TYPES.find((each) => MediaRecorder.isTypeSupported(each));
+export function record(viewer, seconds, show, format) {
+  const type = typeOf(format);
   if (!type) throw new Error("This browser can't record videos. Keep the animation as a file instead.");
   return viewer.opaquely(async () => {
     const stream = viewer.canvas.captureStream(FPS);
@@ -51,15 +62,15 @@ export function record(viewer, seconds, show) {
       await stopped;
       for (const track of stream.getTracks()) track.stop();
     }
-    return { blob: new Blob(parts, { type }), extension: type.includes("mp4") ? "mp4" : "webm" };
+    return { blob: new Blob(parts, { type }), extension: format };
   });
 }
 
 /** Turn the view once around the shape. */
-export async function turntable(viewer, seconds) {
+export async function turntable(viewer, seconds, format) {
   const { view } = viewer;
   try {
-    return await record(viewer, seconds, (share) => viewer.turn(view, 2 * Math.PI * share));
+    return await record(viewer, seconds, (share) => viewer.turn(view, 2 * Math.PI * share), format);
   } finally {
     viewer.view = view;
   }

@@ -4,6 +4,7 @@ import * as api from "../server/api.js";
 import { distant, diverging, gradient, tint } from "./colours.js";
 import { element, find, percentile, readable } from "../dom.js";
 import { report } from "../messages.js";
+import { colourOf } from "./look.js";
 import { nearest } from "./modes.js";
 import { diagonalOf } from "./scene.js";
 import { Surface } from "./surface.js";
@@ -87,12 +88,12 @@ export class Colouring {
 
   /** Return colours (3V) for the shown shape, or null, and fill the legend. */
   of({ mesh, positions }) {
-    const { colour, highlight, regions, moving } = this.store;
-    const region = highlight !== null && !(moving && colour !== "none") && regions?.[highlight];
+    const { colour, highlight, regions } = this.store;
+    const region = highlight !== null && regions?.[highlight];
     const kind = KINDS[colour];
     const values = kind && this.#values(kind, mesh, positions);
     this.legend.hidden = !kind || (colour === "spread" && !values);
-    if (region) return tint(mesh === "fine" ? this.#onFine(region) : region);
+    if (region) return tint(mesh === "fine" ? this.#onFine(region) : region, colourOf(this.store.material));
     return values ? kind.paint(values, this.#limit) : null;
   }
 

@@ -39,9 +39,9 @@ export const distant = (distances, limit) =>
   );
 
 /** Return colours (3V) of weights (V), from the surface's own colour at 0 to the accent at 1. */
-export function tint(weights) {
+export function tint(weights, base = BASE) {
   const colours = new Float32Array(3 * weights.length);
   const colour = new THREE.Color();
-  weights.forEach((weight, i) => colour.lerpColors(BASE, accent, weight).toArray(colours, 3 * i));
+  weights.forEach((weight, i) => colour.lerpColors(base, accent, weight).toArray(colours, 3 * i));
   return colours;
 }

@@ -7,6 +7,7 @@ import * as api from "../server/api.js";
 import { tint } from "./colours.js";
 import { percentile } from "../dom.js";
 import { report } from "../messages.js";
+import { keepMotions, keptMotions, measure, motionsOf } from "../shape/motions.js";
 import { sphereOf } from "./scene.js";
 import { Surface } from "./surface.js";
 
@@ -23,10 +24,11 @@ export class Modes {
     store.on(["model"], () => {
       this.#abort.abort();
       this.#regions = [];
+      store.set({ motions: keptMotions(store.model) });
     });
   }
 
-  /** Draw the pictures of every coordinate; each has the home shape in the middle. */
+  /** Draw the pictures of every coordinate, and name its motion. */
   async draw() {
     const {
       model,
@@ -42,10 +44,12 @@ export class Modes {
       } = await api.shapes(model, [space.home], "coarse", { signal });
       const rest = surface.measure(home);
       const residuals = [];
+      const seen = []; // measures of motions, by coordinate
+      const isKnown = Boolean(this.store.motions);
       for (const [j, factor] of model.factors.entries()) {
         const changes = [];
         for (let k = factor.start; k < factor.stop; k += 1) {
-          const [down, , up] = space.stations(k);
+          const [down, up] = space.ends(k);
           changes.push({ [k]: down }, { [k]: up });
         }
         const codes = changes.map((change) => space.homeBut(change));
@@ -53,9 +57,11 @@ export class Modes {
         residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
-          this.#draw(k, [down, home, up]);
+          this.#draw(k, [down, up]);
+          seen[k] = measure(home, down, up);
           this.#grow(j, surface, rest, [down, up]);
         }
+        if (!isKnown) this.store.set({ motions: motionsOf(model.factors.slice(0, j + 1), seen) });
         this.#regions[j] = smooth(this.#regions[j]);
         this.pictures.draw(
           this.sliders.picture(j),
@@ -64,7 +70,9 @@ export class Modes {
           around(home, this.#regions[j]),
         );
       }
-      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5) });
+      const motions = motionsOf(model.factors, seen);
+      keepMotions(model, motions);
+      this.store.set({ regions: this.#regions, usual: percentile(residuals, 0.5), motions });
     } catch (error) {
       report(error);
     }

@@ -16,8 +16,9 @@ import {
 const LEAST = 0.36; // least share of the shape's radius in a picture, so that a part has surroundings
 
 export class Pictures {
+  #renderer = null; // made with the first picture, because it takes longer than all else here
+
   constructor() {
-    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
     this.camera = litCamera();
     this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), surfaceMaterial());
     this.mesh.frustumCulled = false;
@@ -36,16 +37,17 @@ export class Pictures {
   /** Draw a shape, or its part inside a sphere, into a canvas of the page. */
   draw(canvas, positions, colours, part) {
     const { width, height } = canvas;
-    this.renderer.setSize(width, height, false);
+    this.#renderer ??= new THREE.WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
+    this.#renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     const { center, radius } = part ?? this.sphere;
     frame(this.camera, { center, radius: Math.max(radius, LEAST * this.sphere.radius) });
     move(this.mesh.geometry, positions);
     paint(this.mesh.geometry, colours);
-    this.renderer.render(this.scene, this.camera);
+    this.#renderer.render(this.scene, this.camera);
     const context = canvas.getContext("2d");
     context.clearRect(0, 0, width, height);
-    context.drawImage(this.renderer.domElement, 0, 0);
+    context.drawImage(this.#renderer.domElement, 0, 0);
     canvas.classList.add("drawn");
   }
 }

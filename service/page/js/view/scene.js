@@ -15,16 +15,35 @@ export function surfaceMaterial() {
 /** A camera with lights that move with it, so that the visible side is lit. */
 export function litCamera() {
   const camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 100);
-  const light = (colour, strength, x, y, z) => {
-    const made = new THREE.DirectionalLight(colour, strength);
+  const light = (colour, x = 0, y = 0, z = 0) => {
+    const made = new THREE.DirectionalLight(colour);
     made.position.set(x, y, z);
     camera.add(made, made.target);
+    return made;
   };
-  light(0xfff1e0, 2.1, -1.2, 1.7, 1.5); // key
-  light(0xe4ecff, 0.4, 1.8, -0.2, 1); // fill
-  light(0xdce8ff, 2.2, 1.1, 0.9, -1.5); // rim, from behind
-  camera.add(new THREE.HemisphereLight(0xffffff, 0x8a7a70, 1.05));
+  const key = light(0xfff1e0);
+  const fill = light(0xe4ecff, 1.8, -0.2, 1);
+  const rim = light(0xdce8ff, 1.1, 0.9, -1.5); // from behind
+  const around = new THREE.HemisphereLight(0xffffff, 0x8a7a70);
+  camera.add(around);
+  camera.userData.lights = [key, fill, rim, around];
+  illuminate(camera, "studio");
   return camera;
+}
+
+/** Strengths of the key, fill and rim lights and of the light from all around, and the key's position. */
+const LIGHTS = {
+  studio: { strengths: [2.1, 0.4, 2.2, 1.05], key: [-1.2, 1.7, 1.5] },
+  soft: { strengths: [0.9, 0.6, 0.8, 2.1], key: [-0.4, 1.2, 2] },
+  side: { strengths: [3.6, 0.08, 2.6, 0.22], key: [-2.2, 0.9, 0.2] },
+};
+
+/** Set the light of a camera by its name. */
+export function illuminate(camera, name) {
+  const { strengths, key } = LIGHTS[name];
+  const { lights } = camera.userData;
+  strengths.forEach((strength, k) => Object.assign(lights[k], { intensity: strength }));
+  lights[0].position.set(...key);
 }
 
 /** Return the tangent of half the angle of a camera's height. */
@@ -35,11 +54,12 @@ const distanceOf = (camera, { radius }) =>
   radius / Math.sin(Math.atan(slope(camera) * Math.min(camera.aspect, 1)));
 
 /**
- * Return the distance at which positions (3V numbers) fit the width and a share of the height of the view.
+ * Return the distance at which positions (3V numbers) fit the width and a share of the height of the view,
+ * for a camera in a direction from the centre.
  */
-export function distanceTo(camera, positions, center, share) {
+export function distanceTo(camera, positions, center, share, direction = VIEW) {
   const back = new THREE.Quaternion()
-    .setFromRotationMatrix(new THREE.Matrix4().lookAt(VIEW, new THREE.Vector3(), camera.up))
+    .setFromRotationMatrix(new THREE.Matrix4().lookAt(direction, new THREE.Vector3(), camera.up))
     .invert();
   const high = slope(camera) * share;
   const wide = slope(camera) * camera.aspect;
@@ -117,9 +137,9 @@ export function move(geometry, positions) {
 }
 
 /** Colour each vertex by `colours` (3V numbers in linear sRGB); without them, use the surface's colour. */
-export function paint(geometry, colours) {
+export function paint(geometry, colours, base = BASE) {
   const { array } = geometry.attributes.color;
   if (colours) array.set(colours);
-  else for (let i = 0; i < array.length; i += 3) BASE.toArray(array, i);
+  else for (let i = 0; i < array.length; i += 3) base.toArray(array, i);
   geometry.attributes.color.needsUpdate = true;
 }

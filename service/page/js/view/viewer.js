@@ -7,6 +7,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/OrbitControls.js";
 import {
+  VIEW,
   distanceTo,
   face,
   frame,
@@ -16,17 +17,22 @@ import {
   paint,
   sideOf,
   sphereOf,
-  surfaceMaterial,
 } from "./scene.js";
+import { BEHIND, colourOf, materials } from "./look.js";
+import { Picker } from "./picker.js";
 import { Stage } from "./stage.js";
 
 const TURN = Math.PI / 24;
+const SPEED = 4; // of a view that turns by itself: 15 s a turn
+const LOWEST = Math.PI / 2; // angle of the camera from the vertical: never below the ground
+const ROOM_FOR_TWO = 1.2; // the legend, which is often shown then, hides a corner
 const ROOM = 1.08; // factor of the distance, for shapes that are larger than the reference
 
 export class Viewer {
   #scheduled = false;
   #share = 1; // share of the height that is free for the shape
   #grounds = [];
+  #back = 0; // times by which the camera has moved back for a second shape
 
   /** `margin`: pixels of the canvas's height below buttons and text. */
   constructor(canvas, margin) {
@@ -38,14 +44,22 @@ export class Viewer {
     this.camera = litCamera();
     this.scene.add(this.camera);
     this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.zoomToCursor = true;
+    this.controls.maxPolarAngle = LOWEST;
     this.controls.addEventListener("change", () => this.draw());
     this.controls.addEventListener("end", () => this.#turned());
     /** Whether the view differs from the initial one. */
     this.turned = false;
 
-    this.materials = { surface: surfaceMaterial(), normals: new THREE.MeshNormalMaterial() };
+    this.material = materials(this.renderer);
+    this.normals = new THREE.MeshNormalMaterial(BEHIND);
+    /** @type {THREE.Side} */
+    this.side = THREE.FrontSide;
+    this.worn = "own";
+    /** A second shape in the same material, if there is one. @type {THREE.Mesh | null} */
+    this.companion = null;
     /** @type {THREE.Mesh<THREE.BufferGeometry, THREE.Material>} */
-    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.materials.surface);
+    this.mesh = new THREE.Mesh(new THREE.BufferGeometry(), this.surface);
     const wires = new THREE.MeshBasicMaterial({
       wireframe: true,
       color: 0x1f2a37,
@@ -53,17 +67,7 @@ export class Viewer {
       opacity: 0.55,
     });
     this.wires = new THREE.Mesh(this.mesh.geometry, wires);
-    // Lines lie on the surface; slightly nearer to the camera, they don't flicker.
-    Object.assign(this.materials.surface, {
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
-    });
-    Object.assign(this.materials.normals, {
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
-    });
+    this.picker = new Picker(canvas, this.camera, this.mesh);
     this.mesh.frustumCulled = this.wires.frustumCulled = false;
     // Not drawn while empty, because three.js would choose flat shading without normals, and keep it.
     this.mesh.visible = this.wires.visible = false;
@@ -78,6 +82,7 @@ export class Viewer {
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
     this.#resize();
     canvas.addEventListener("keydown", (event) => this.#key(event));
+    canvas.addEventListener("dblclick", () => this.focus());
     canvas.addEventListener("webglcontextrestored", () => this.draw());
   }
 
@@ -94,7 +99,8 @@ export class Viewer {
     this.middle = this.sphere.center;
     this.stage.open(this.sphere);
     this.side = sideOf(reference.faces, reference.vertices.length / 3);
-    for (const material of Object.values(this.materials)) face(material, this.side);
+    face(this.normals, this.side);
+    face(this.surface, this.side);
     this.resetView();
   }
 
@@ -116,7 +122,7 @@ export class Viewer {
     const { skin, mesh } = this;
     if (!mesh.geometry.index) return; // no shape is shown yet
     const wears = Boolean(skin) && mesh.geometry === this.geometries[this.skinOf];
-    this.skinned.visible = wears && !this.coloured && mesh.material === this.materials.surface;
+    this.skinned.visible = wears && this.worn === "own" && !this.coloured && mesh.material !== this.normals;
     mesh.visible = !this.skinned.visible;
     if (wears) skin.follow(mesh.geometry);
   }
@@ -125,7 +131,7 @@ export class Viewer {
   show(name, positions, colours, placement) {
     const geometry = this.geometries[name];
     move(geometry, positions);
-    paint(geometry, colours);
+    paint(geometry, colours, this.base);
     this.mesh.geometry = this.wires.geometry = geometry;
     for (const mesh of [this.mesh, this.wires, this.skinned]) {
       mesh.matrixAutoUpdate = false;
@@ -139,18 +145,57 @@ export class Viewer {
   }
 
   paint(colours) {
-    paint(this.mesh.geometry, colours);
+    paint(this.mesh.geometry, colours, this.base);
     this.coloured = Boolean(colours);
     this.#wear();
     this.draw();
   }
 
-  /** Set whether lines are shown, and whether colours show normals. */
-  style({ wireframe, normals }) {
+  /** The material of the surface, drawn on the sides that the model needs. */
+  get surface() {
+    const material = this.material(this.worn);
+    return material.side === this.side ? material : face(material, this.side);
+  }
+
+  /** The colour of the surface where it has no other. */
+  get base() {
+    return colourOf(this.worn);
+  }
+
+  /** Set the material, whether lines are shown, and whether colours show normals. */
+  style({ wireframe, normals, material, colour }) {
     this.wires.visible = wireframe;
-    this.mesh.material = normals ? this.materials.normals : this.materials.surface;
+    this.worn = colour === "none" ? material : "clay"; // colours are read on a matt surface
+    this.mesh.material = normals ? this.normals : this.surface;
+    if (this.companion) this.cover(this.companion);
     this.#wear();
     this.draw();
+  }
+
+  /** Give a second shape the surface of the first. */
+  cover(mesh) {
+    this.companion = mesh;
+    mesh.material = this.surface;
+    if (mesh.geometry.attributes.color) paint(mesh.geometry, null, this.base);
+  }
+
+  /** Whether the view turns by itself. */
+  get spins() {
+    return this.controls.autoRotate;
+  }
+
+  /** Start or stop to turn by itself. */
+  spin(on) {
+    if (this.spins && !on) this.#turned();
+    Object.assign(this.controls, { autoRotate: on, autoRotateSpeed: SPEED });
+    let before = performance.now();
+    const step = (now) => {
+      if (!this.spins) return;
+      this.controls.update(Math.max(now - before, 0) / 1000);
+      before = now;
+      requestAnimationFrame(step);
+    };
+    if (on) requestAnimationFrame(step);
   }
 
   /** Add a ground below a shape. */
@@ -174,12 +219,27 @@ export class Viewer {
 
   resetView() {
     this.turned = false;
+    this.#back = 0;
     frame(this.camera, { center: this.middle, radius: this.sphere.radius }, this.#distance);
     this.controls.target.copy(this.middle);
     this.controls.minDistance = 0.2 * this.sphere.radius;
     this.controls.maxDistance = 20 * this.sphere.radius;
     this.controls.update();
     this.draw();
+  }
+
+  /** Fill the view with the shape, from the direction of the view. */
+  focus() {
+    if (!this.mesh.geometry.index) return; // no shape is shown yet
+    const { positions } = this.picker;
+    const middle = sphereOf(positions).center;
+    const back = this.camera.position.clone().sub(this.controls.target).normalize();
+    const distance = ROOM * distanceTo(this.camera, positions, middle, this.#share, back);
+    this.controls.target.copy(middle);
+    this.camera.position.copy(middle).addScaledVector(back, distance);
+    this.controls.update();
+    this.draw();
+    this.#turned();
   }
 
   /**
@@ -193,7 +253,16 @@ export class Viewer {
     this.middle = sphereOf(this.seen).center;
     if (!this.turned) this.resetView();
     else if (!given) {
-      this.#move(this.middle.clone().sub(middle), this.#distance / before);
+      // Both shapes fit, however near the camera was; afterwards the camera returns to its distance.
+      const now = this.#distance;
+      const away = this.camera.position.distanceTo(this.controls.target);
+      const times = positions
+        ? Math.max(now / before, now / away)
+        : this.#back
+          ? 1 / this.#back
+          : now / before;
+      this.#back = positions ? (this.#back || 1) * times : 0;
+      this.#move(this.middle.clone().sub(middle), times);
       // The address may be older than the shape.
       this.canvas.dispatchEvent(new Event("turned"));
     }
@@ -210,7 +279,9 @@ export class Viewer {
 
   /** Return the distance at which the shapes fill the free part of the picture. */
   get #distance() {
-    return ROOM * distanceTo(this.camera, this.seen, this.middle, this.#share);
+    const from = this.turned ? this.camera.position.clone().sub(this.controls.target) : VIEW;
+    const room = this.seen === this.reference ? ROOM : ROOM_FOR_TWO;
+    return room * distanceTo(this.camera, this.seen, this.middle, this.#share, from);
   }
 
   /** Position and target of the camera, as six numbers. */
@@ -259,44 +330,6 @@ export class Viewer {
     }
   }
 
-  /** Return the vertex nearest to the surface under a point of the window, or null. */
-  pick({ clientX, clientY }) {
-    const box = this.canvas.getBoundingClientRect();
-    const point = new THREE.Vector2(
-      ((clientX - box.left) / box.width) * 2 - 1,
-      1 - ((clientY - box.top) / box.height) * 2,
-    );
-    const caster = new THREE.Raycaster();
-    caster.setFromCamera(point, this.camera);
-    const hit = caster.intersectObject(this.mesh)[0];
-    if (!hit) return null;
-    const { geometry, matrixWorld } = this.mesh;
-    const at = (vertex) =>
-      new THREE.Vector3().fromBufferAttribute(geometry.attributes.position, vertex).applyMatrix4(matrixWorld);
-    const corners = [hit.face.a, hit.face.b, hit.face.c];
-    const vertex = corners.reduce((a, b) =>
-      at(a).distanceTo(hit.point) <= at(b).distanceTo(hit.point) ? a : b,
-    );
-    return { vertex, position: at(vertex) };
-  }
-
-  /** Return the position of a point in the picture, in pixels from the upper left. */
-  project(position) {
-    const { x, y } = position.clone().project(this.camera);
-    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight };
-  }
-
-  /** Return the point at a place of the window, at the depth of `depth`. */
-  unproject({ clientX, clientY }, depth) {
-    const box = this.canvas.getBoundingClientRect();
-    const { z } = depth.clone().project(this.camera);
-    return new THREE.Vector3(
-      ((clientX - box.left) / box.width) * 2 - 1,
-      1 - ((clientY - box.top) / box.height) * 2,
-      z,
-    ).unproject(this.camera);
-  }
-
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     if (!width || !height) return;
@@ -319,11 +352,13 @@ export class Viewer {
       const spherical = new THREE.Spherical().setFromVector3(offset);
       spherical.theta += TURN * turns[event.key][0];
       spherical.phi += TURN * turns[event.key][1];
+      spherical.phi = Math.min(spherical.phi, LOWEST);
       offset.setFromSpherical(spherical.makeSafe());
     } else if (event.key in zooms) {
       offset.multiplyScalar(zooms[event.key]);
     } else if (event.key === "0" || event.key === "Home") {
       this.resetView();
+      this.canvas.dispatchEvent(new Event("turned")); // the address forgets the view
       event.preventDefault();
       return;
     } else return;

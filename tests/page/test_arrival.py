@@ -1,0 +1,57 @@
+"""What is seen until the scripts and the first shape have arrived."""
+
+import re
+
+import numpy as np
+
+from tests.page.conftest import Open
+from tests.page.studio import Hold
+
+
+def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open) -> None:
+    studio = window()
+    held = Hold(studio.page, "**/js/view/*.js")
+    answered: list[str] = []
+    studio.page.on("requestfinished", lambda request: answered.append(request.url))
+    studio.page.goto(f"{studio.url}/#model=figure", wait_until="commit")
+    # The answers for the first shape come beside the scripts.
+    for call in ("/v1/models$", "figure/mesh", "figure/vertices", "poster/figure.svg"):
+        studio.eventually(lambda call=call: any(re.search(call, url) for url in answered))  # type: ignore[misc]
+    assert studio["#without"].is_hidden()
+    assert studio["#busy"].is_visible()
+    assert studio.waits
+    drawn = studio.picture()
+    ink = (np.abs(drawn - drawn[0, 0]).max(axis=2) > 40).any(axis=1)
+    assert np.ptp(np.flatnonzero(ink)) > 0.7 * len(drawn), "the drawing fills the stage"
+    assert studio["#random"].evaluate("e => e.closest('[inert]') !== null")
+    asked = list(studio.asked)
+    held.release()
+    studio.rest()
+    assert studio["#poster"].is_hidden()
+    assert studio["#busy"].is_hidden()
+    assert not studio.waits
+    # The first draft is not requested again.
+    assert [body for body in studio.asked if body == asked[0]] == asked
+
+
+def test_a_script_that_does_not_arrive_is_told_with_a_way_out(window: Open) -> None:
+    studio = window(complains=True)
+    studio.page.route("**/js/view/stage.js", lambda route: route.abort())
+    studio.page.goto(f"{studio.url}/#model=with-fine&z=0.1,0,0")
+    studio.eventually(studio["#lost"].is_visible)
+    assert studio["#without"].is_hidden()
+    assert studio["main"].is_hidden()
+    studio.page.unroute("**/js/view/stage.js")
+    studio["#lost a"].click()
+    studio.rest()
+    assert studio.code == [0.1, 0, 0]
+    assert studio["#lost"].is_hidden()
+
+
+def test_the_first_shape_of_an_address_is_asked_for_once(window: Open) -> None:
+    studio = window().open("#model=with-fine&z=0.1,1,0.5")
+    first = [body for body in studio.asked if body["quality"] == "draft" and body["mesh"] == "coarse"]
+    assert [body["latents"] for body in first[:1]] == [[[0.1, 1, 0.5]]]
+    assert first.count(first[0]) == 1
+    assert sum("mesh=coarse" in address for address in studio.addresses) == 1
+    assert sum(address.endswith("/v1/models") for address in studio.addresses) == 1

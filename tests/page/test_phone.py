@@ -1,0 +1,86 @@
+"""The page on a phone, upright and on its side, and in a window at 200 % zoom."""
+
+import pytest
+
+from tests.page.conftest import Open
+from tests.page.studio import OpenPage
+
+#: How many sliders can be seen and touched.
+SLIDERS = """all => all.filter((slider) => {
+    const { left, right, top, bottom } = slider.getBoundingClientRect();
+    const isInside = left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight;
+    return isInside && document.elementFromPoint((left + right) / 2, (top + bottom) / 2) === slider;
+}).length"""
+
+
+def sliders(studio: OpenPage) -> int:
+    return int(studio[".coordinate input[type=range]"].evaluate_all(SLIDERS))
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (640, 400)])
+def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: int) -> None:
+    options = {"viewport": {"width": width, "height": height}, "has_touch": True, "is_mobile": width != 640}
+    studio = window(**options).open("#model=figure")
+    for model in ("figure", "with-fine"):
+        if model != "figure":
+            studio.open(f"#model={model}")
+            studio.eventually(lambda: studio[".coordinate"].count() == 3)
+        assert (studio["#welcome"].is_visible(), sliders(studio) >= 3) == (model == "figure", True)
+        if model == "figure":
+            studio["#welcome [data-do=close]"].click()
+            assert sliders(studio) >= 3
+        assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    header = studio["header"].bounding_box()
+    assert header
+    assert header["height"] < 60, "the header has one row"
+    row = studio.coordinate(0)
+    outer = row.bounding_box()
+    for part in (".name", "input[type=number]", "input[type=range]", "[data-do=lock]"):
+        inner = row.locator(part).bounding_box()
+        assert outer
+        assert inner
+        assert outer["y"] <= inner["y"] + 1
+        assert inner["y"] + inner["height"] <= outer["y"] + outer["height"] + 1
+    assert outer is not None
+    assert outer["height"] < 64
+    studio["#to-more"].click()
+    for name in ("#seed", "#theme", "#about"):
+        assert studio[name].is_visible()
+    studio["#about"].click()
+    studio.eventually(studio["#card"].is_visible)
+
+
+def test_the_sheet_is_dragged_pressed_and_moved_by_keys(window: Open) -> None:
+    studio = window(viewport={"width": 390, "height": 844}).open()
+    handle = studio["#sheet"]
+
+    def drag(by: float) -> tuple[float, str | None]:
+        box = handle.bounding_box()
+        assert box
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        studio.page.mouse.move(x, y)
+        studio.page.mouse.down()
+        studio.page.mouse.move(x, y + by, steps=3)
+        studio.page.mouse.up()
+        panel = studio[".panel"].bounding_box()
+        assert panel
+        return panel["height"], handle.get_attribute("aria-valuenow")
+
+    middle = studio[".panel"].bounding_box()
+    assert middle
+    most, share = drag(-250)
+    assert (most > 1.5 * middle["height"], share) == (True, "80")
+    least, share = drag(700)
+    assert (least < 100, share) == (True, "0")
+    assert studio["#to-files"].is_visible()
+    assert drag(0)[0] == pytest.approx(middle["height"]), "a press opens it"
+    handle.press("ArrowUp")
+    assert handle.get_attribute("aria-valuenow") == "80"
+    handle.press("Home")
+    assert handle.get_attribute("aria-valuenow") == "0"
+
+
+def test_where_the_page_scrolls_a_finger_on_the_shape_scrolls_it(window: Open) -> None:
+    studio = window(viewport={"width": 320, "height": 480}).open()
+    assert studio["#canvas"].evaluate("c => getComputedStyle(c).touchAction") == "pan-y"
+    assert studio.page.evaluate("document.documentElement.scrollHeight > innerHeight")
