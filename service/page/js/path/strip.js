@@ -13,7 +13,13 @@ export class Strip {
     this.pictures = pictures;
     this.table = table;
     this.button = button;
-    store.on(["keyframes", "model", "names"], () => {
+    // The page may learn names of sliders while the strip is there.
+    store.on(["names"], () => {
+      table.querySelectorAll("tbody th").forEach((head, row) => {
+        if (row > 0) head.textContent = store.names.factors[row - 1] ?? "";
+      });
+    });
+    store.on(["keyframes", "model"], () => {
       table.hidden = true;
       button.disabled = store.keyframes.length < 2;
     });
