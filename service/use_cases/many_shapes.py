@@ -176,9 +176,19 @@ def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
 
 
 async def shapes(
-    work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice, quality: Quality
+    work: Batch,
+    model: ShapeModel,
+    codes: Codes,
+    inside: NDArray[np.bool_],
+    mesh: MeshChoice,
+    quality: Quality,
+    *,
+    apart: bool = False,
 ) -> ShapeBatch:
-    """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``."""
+    """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``.
+
+    Networks run for several codes at once, which changes the last digits, or for each code ``apart``.
+    """
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
     def find(some: slice, call: Call) -> list[tuple[Diagnostics, Timings]]:
@@ -189,7 +199,8 @@ async def shapes(
             found.append((shape.diagnostics, shape.seconds))
         return found
 
-    found = [*chain(*await work.map(find, model.decoder.batches(codes, quality)))]
+    batches = (slice(k, k + 1) for k in range(len(codes))) if apart else model.decoder.batches(codes, quality)
+    found = [*chain(*await work.map(find, batches))]
     return ShapeBatch(
         vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found)
     )

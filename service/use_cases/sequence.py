@@ -85,7 +85,8 @@ async def sequence_file(
     # Colours take as much memory as positions.
     caller = replace(caller, long=True)
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
-        found = await shapes(work, model, codes, inside, mesh, quality)
+        # A frame has the same bytes alone and in the whole animation.
+        found = await shapes(work, model, codes, inside, mesh, quality, apart=True)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
         surface = with_topology(model.decoder.surface(mesh), topology)
 
@@ -123,12 +124,12 @@ async def sequence_lines(
             return found, error
         return found, None
 
-    # Each batch has its own deadline, because a stream may take as long as its reader takes.
+    # Each frame has its own deadline, because a stream may take as long as its reader takes.
     caller = replace(caller, long=True)
     with workers.stream(caller):
         # The first frame is computed alone: with the second it would take half as long again.
         first = slice(0, 1)
-        rest = (slice(some.start + 1, some.stop + 1) for some in model.decoder.batches(codes[1:], quality))
+        rest = (slice(k, k + 1) for k in range(1, len(codes)))
         ready, error = await workers.piece(partial(lines, first), caller)
         for line in ready:
             yield line
