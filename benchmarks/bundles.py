@@ -7,6 +7,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from shapespace.arrays import FloatArray
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm
 from shapespace.model.latent_space import Codes
 from shapespace.model.shape_model import ShapeModel
 
@@ -23,6 +25,13 @@ def draw(model: ShapeModel, count: int, spread: float = 1.0) -> Codes:
     radius = spread * (model.latents.upper - model.latents.lower) / 2
     codes = centre + radius * np.random.default_rng(0).uniform(-1, 1, (count, len(centre)))
     return model.latents.codes(codes.tolist())[0]
+
+
+def normal_matrix(model: ShapeModel, vertices: FloatArray) -> sparse.csr_array:
+    """Return ``JᵀWJ`` at a normalised shape."""
+    weights = WeightedNorm.of(model.reference, model.manifest.eta_reconstruction).squared
+    jacobian = NRICJacobian(model.reference.connectivity)(vertices)
+    return sparse.csr_array(jacobian.T @ sparse.diags_array(weights) @ jacobian)
 
 
 def superlu(matrix: sparse.sparray) -> Callable[[], object]:

@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,12 +13,17 @@ import httpx
 
 
 @contextmanager
-def server(models: Path, **settings: object) -> Iterator[tuple[httpx.Client, int, float]]:
-    """Start a server process; yield a client, the process id, and the seconds until it was ready."""
+def server(
+    models: Path, program: Sequence[str] = ("shapespace.service",), **settings: object
+) -> Iterator[tuple[httpx.Client, int, float]]:
+    """Start a server process; yield a client, the process id, and the seconds until it was ready.
+
+    The program is a module and its arguments. It prints its address.
+    """
     began = time.perf_counter()
     more = {f"SHAPESPACE_{name.upper()}": str(value) for name, value in settings.items()}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "shapespace.service"],
+    process = subprocess.Popen(  # noqa: S603 - our own programs
+        [sys.executable, "-m", *program],
         env={**os.environ, "SHAPESPACE_MODELS_DIR": str(models), "SHAPESPACE_PORT": "0", **more},
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
     from shapespace.model.blend_shapes import PeriodicError
     from shapespace.model.correspondence import InvalidMeshError
-    from shapespace.model.decoder import MeshChoice, ModelFailedError, Quality
+    from shapespace.model.decoder import MeshChoice, ModelFailedError
     from shapespace.model.edit import InvalidTargetError
     from shapespace.model.fit_result import FitStatus
     from shapespace.model.latent_space import Bounds, Distribution, LatentError
@@ -87,6 +87,7 @@ if TYPE_CHECKING:
         Target,
     )
     from shapespace.model.scan import InvalidScanError
+    from shapespace.model.shape import Quality
     from shapespace.model.shape_model import ShapeModel, load
     from shapespace.shell.energy import Material
     from shapespace.shell.exponential import exponential
@@ -114,12 +115,13 @@ _NAMES = {
     "mesh.triangle_mesh": "MeshError TriangleMesh",
     "model.blend_shapes": "PeriodicError",
     "model.correspondence": "InvalidMeshError",
-    "model.decoder": "MeshChoice ModelFailedError Quality",
+    "model.decoder": "MeshChoice ModelFailedError",
     "model.edit": "InvalidTargetError",
     "model.fit_result": "FitStatus",
     "model.latent_space": "Bounds Distribution LatentError",
     "model.options": "EditOptions EncodeOptions FitOptions Landmark Objective Prior PriorKind ScaleChoice Target",
     "model.scan": "InvalidScanError",
+    "model.shape": "Quality",
     "model.shape_model": "ShapeModel load",
     "shell.energy": "Material",
     "shell.exponential": "exponential",

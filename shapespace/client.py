@@ -151,8 +151,8 @@ class Client:
             format: glb, gltf, obj, ply, stl, npz, zip (OBJ with materials and textures) or json.
             place: placement of the shape, for example the ``placement`` that ``edit`` returns.
             covariance: (m, m) covariance of codes around ``latent``, to colour vertices by their standard deviation.
-            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or
-                "draft"), color, topology ("original" or "triangles").
+            options: version, mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("auto",
+                "full" or "draft"), color, topology ("original" or "triangles").
         """
         path, params = f"/v1/models/{name}/mesh", {"format": format, "place": _json(place), **options}
         if covariance is not None:
@@ -195,7 +195,8 @@ class Client:
             latents: (n, m) codes.
             version: version of the model; by default the server's default version.
             place: placement of the shapes, see ``mesh``.
-            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("full" or "draft").
+            options: mesh ("fine" or "coarse"), bounds ("allow", "clamp" or "reject"), quality ("auto", "full" or
+                "draft").
         """
         params = {"version": version, "format": "npz", "place": _json(place)}
         body = {"latents": _numbers(latents), "faces": False, **options}
@@ -210,7 +211,7 @@ class Client:
         return np.array(answer["lengths"]), np.array(answer["angles"])
 
     def interpolate(
-        self, name: str, keyframes: ArrayLike, *, version: str | None = None, quality: str = "full", **options: Any
+        self, name: str, keyframes: ArrayLike, *, version: str | None = None, quality: str = "auto", **options: Any
     ) -> Interpolation:
         """Make an animation along a path of codes.
 
@@ -218,7 +219,7 @@ class Client:
             name: name of the model.
             keyframes: (k, m) codes, at least two.
             version: version of the model; by default the server's default version.
-            quality: quality of the frames, "full" or "draft".
+            quality: quality of the frames, "auto", "full" or "draft".
             options: frames, times, start, stop, loop, mesh, name.
         """
         body = {"keyframes": _numbers(keyframes), **options}
@@ -341,13 +342,13 @@ class Interpolation:
         client: client that asked for the animation.
         id: the whole request, so that any replica can answer it at any time.
         frames: number of frames.
-        quality: "full", or "draft", which is quicker and nearly the same.
+        quality: "auto"; "full", the converged solution; or "draft", the quickest.
     """
 
     client: Client
     id: str
     frames: int
-    quality: str = "full"
+    quality: str = "auto"
 
     def __iter__(self) -> Iterator[NDArray[np.float32]]:
         path, http = f"/v1/interpolations/{self.id}", self.client._http

@@ -15,8 +15,9 @@ import click
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import DECODER, MANIFEST
-from shapespace.bundle.writer import add_decoder
+from shapespace.bundle.writer import add_decoder, amend_bundle
 from shapespace.command_line import carry_out, near
+from shapespace.model.accuracy import measure_accuracy
 from shapespace.model.decoder import Decoder
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
@@ -196,18 +197,20 @@ def report(run: Path) -> None:
 def export(run: Path, models: Path) -> None:
     """Finish a run and write its bundle, or add ``decoder.onnx`` to a bundle."""
     if (run / MANIFEST).is_file() and not (run / "config.toml").exists():
-        _add_decoder(run.resolve())
+        _complete(run.resolve())
         return
     opened = _open(run, models)
     _execute(opened, keep_going=True)
     print(f"{near(opened.bundle)} is ready. Next: {_serving(opened.models)}")
 
 
-def _add_decoder(folder: Path) -> None:
-    """Write ``decoder.onnx`` into a bundle that has none, or replace it."""
+def _complete(folder: Path) -> None:
+    """Write what this version exports and older ones did not: ``decoder.onnx``, ``auto_error`` and the card."""
     from shapespace.training.learning.decoder_graph import decoder_graph
 
     bundle = read_bundle(folder)
-    made = decoder_graph(bundle, Decoder(bundle))
+    decoder = Decoder(bundle)
+    made = decoder_graph(bundle, decoder)
+    amend_bundle(folder, auto_error=measure_accuracy(decoder).auto_error)
     add_decoder(folder, made)
     print(f"{near(folder)} has {DECODER} now" if made.entry else f"{near(folder)} has no {DECODER}: {made.absent}")

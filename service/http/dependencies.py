@@ -11,7 +11,8 @@ from fastapi import Depends, Path, Query, Request
 from pydantic import Field, WithJsonSchema
 from starlette.exceptions import HTTPException
 
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
@@ -77,10 +78,15 @@ MeshQuery = Annotated[
     MeshChoice | None, Query(alias="mesh", description="Overrides `mesh` in the body: `fine` or `coarse`.")
 ]
 QualityQuery = Annotated[
-    Quality, Query(alias="quality", description="`draft` omits Gauss–Newton if the first guess is accurate enough.")
+    Quality,
+    Query(
+        alias="quality",
+        description="`auto` is as close to the exact shape as `full`, within a tenth. `full` solves to convergence. "
+        "`draft` omits Gauss–Newton if the first guess is accurate enough.",
+    ),
 ]
 QualityOfBody = Annotated[
-    Quality | None, Query(alias="quality", description="Overrides `quality` in the body: `full` or `draft`.")
+    Quality | None, Query(alias="quality", description="Overrides `quality` in the body: `auto`, `full` or `draft`.")
 ]
 #: In the path of routes that name it there, as in the Open Inference Protocol; otherwise in the query.
 Version = Annotated[

@@ -12,8 +12,8 @@ from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from shapespace.mesh.attributes import Topology
-from shapespace.model.decoder import Quality
 from shapespace.model.latent_space import CheckedCode
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Service

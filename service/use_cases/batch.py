@@ -9,12 +9,17 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from shapespace.files.archives import Buffer
-from shapespace.model.decoder import MeshChoice, Quality, Shape
-from shapespace.model.latent_space import CheckedCode
+from shapespace.model.decoder import MeshChoice
+from shapespace.model.latent_space import CheckedCode, Codes
+from shapespace.model.shape import Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
 from shapespace.service.tracing import record_stages
+from shapespace.solve.blas_threads import OneBlasThread
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -118,11 +123,28 @@ def solve(
     workers: Workers, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
 ) -> Shape:
     """Return the shape of a code; raises DeadlineError."""
-    shape = model.shape(*code, mesh, deadline, quality)
-    if shape.diagnostics.status is Status.DEADLINE:
-        raise workers.late()
-    record_stages(shape.seconds)
-    return shape
+    return next(solve_all(workers, model, mesh, quality, (code[0][None], np.array([code[1]])), deadline))
+
+
+def solve_all(
+    workers: Workers,
+    model: ShapeModel,
+    mesh: MeshChoice,
+    quality: Quality,
+    codes: tuple[Codes, NDArray[np.bool_]],
+    deadline: Deadline,
+) -> Iterator[Shape]:
+    """Yield the shapes of codes (n, m), with (n,) whether each is inside the bounds; raises DeadlineError."""
+    found = model.decoder.shapes(*codes, mesh, deadline, quality)
+    while True:
+        with OneBlasThread():
+            shape = next(found, None)
+        if shape is None:
+            return
+        if shape.diagnostics.status is Status.DEADLINE:
+            raise workers.late()
+        record_stages(shape.seconds)
+        yield shape
 
 
 def total_seconds(seconds: Iterable[Timings]) -> Timings:

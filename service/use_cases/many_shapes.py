@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from shapespace.files.npz import npz_pieces
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.blend_shapes import blend_shapes, require_ends
-from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
-from shapespace.model.latent_space import Bounds, CheckedCode, Codes
+from shapespace.model.latent_space import Bounds, Codes
+from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
 from shapespace.service.use_cases.batch import (
@@ -28,6 +30,7 @@ from shapespace.service.use_cases.batch import (
     TooManyCodesError,
     batch,
     solve,
+    solve_all,
     total_seconds,
 )
 from shapespace.service.use_cases.one_shape import place_vertices
@@ -71,7 +74,7 @@ async def vertices_file(
     mesh: MeshChoice,
     format: str,
     *,
-    quality: Quality = Quality.FULL,
+    quality: Quality = Quality.AUTO,
     exponentials: bool = False,
     place: Placement | None = None,
     faces: bool = True,
@@ -173,18 +176,31 @@ def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
 
 
 async def shapes(
-    work: Batch, model: ShapeModel, codes: Codes, inside: NDArray[np.bool_], mesh: MeshChoice, quality: Quality
+    work: Batch,
+    model: ShapeModel,
+    codes: Codes,
+    inside: NDArray[np.bool_],
+    mesh: MeshChoice,
+    quality: Quality,
+    *,
+    apart: bool = False,
 ) -> ShapeBatch:
-    """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``."""
+    """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``.
+
+    Networks run for several codes at once, which changes the last digits, or for each code ``apart``.
+    """
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
-    def find(item: tuple[int, CheckedCode], call: Call) -> tuple[Diagnostics, Timings]:
-        k, code = item
-        shape = solve(work.workers, model, mesh, quality, code, call)
-        vertices[k] = shape.vertices
-        return shape.diagnostics, shape.seconds
+    def find(some: slice, call: Call) -> list[tuple[Diagnostics, Timings]]:
+        found = []
+        solved = solve_all(work.workers, model, mesh, quality, (codes[some], inside[some]), call)
+        for k, shape in enumerate(solved, some.start):
+            vertices[k] = shape.vertices
+            found.append((shape.diagnostics, shape.seconds))
+        return found
 
-    found = await work.map(find, enumerate(zip(codes, map(bool, inside), strict=True)))
+    batches = (slice(k, k + 1) for k in range(len(codes))) if apart else model.decoder.batches(codes, quality)
+    found = [*chain(*await work.map(find, batches))]
     return ShapeBatch(
         vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found)
     )

@@ -14,8 +14,9 @@ from shapespace.arrays import FloatArray
 from shapespace.files.colouring import Colouring, Quantity
 from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Diagnostics, MeshChoice, Quality, Shape
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
+from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import vertex_uncertainty
 from shapespace.service.limits.workers import Caller, Workers
@@ -45,7 +46,7 @@ class ShapeRequest:
     code: CheckedCode | None
     mesh: MeshChoice
     format: str
-    quality: Quality = Quality.FULL
+    quality: Quality = Quality.AUTO
     colour_by: ColourOptions | None = None
     place: Placement | None = None
     topology: Topology = Topology.ORIGINAL

@@ -15,13 +15,13 @@ from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
 from shapespace.files.colouring import Colouring
 from shapespace.mesh.attributes import Topology
-from shapespace.model.decoder import Quality
-from shapespace.model.latent_space import CheckedCode, Codes
+from shapespace.model.latent_space import CheckedCode
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
-from shapespace.service.use_cases.batch import EncodedFile, batch, solve
+from shapespace.service.use_cases.batch import EncodedFile, batch, solve_all
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.one_shape import ColourOptions
 from shapespace.service.use_cases.sequence_formats import Frames, encode_frames, json_line
@@ -85,7 +85,8 @@ async def sequence_file(
     # Colours take as much memory as positions.
     caller = replace(caller, long=True)
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
-        found = await shapes(work, model, codes, inside, mesh, quality)
+        # A frame has the same bytes alone and in the whole animation.
+        found = await shapes(work, model, codes, inside, mesh, quality, apart=True)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
         surface = with_topology(model.decoder.surface(mesh), topology)
 
@@ -111,20 +112,35 @@ async def sequence_lines(
     codes, inside = model.latents.codes(animation.codes(model.latents))
     faces = model.mesh(animation.mesh).faces
 
-    def line(frame: tuple[int, float, Codes, bool], deadline: Deadline) -> bytes:
-        k, t, code, inside = frame
-        shape = solve(workers, model, animation.mesh, quality, (code, inside), deadline)
-        return json_line(k, t, shape, None if k else faces)
+    def lines(some: slice, deadline: Deadline) -> tuple[list[bytes], Exception | None]:
+        """Return the lines of some frames; with an error only the lines before it."""
+        found: list[bytes] = []
+        solved = solve_all(workers, model, animation.mesh, quality, (codes[some], inside[some]), deadline)
+        times = animation.positions[some].tolist()
+        try:
+            for k, t, shape in zip(count(some.start), times, solved, strict=False):
+                found.append(json_line(k, t, shape, None if k else faces))
+        except Exception as error:
+            return found, error
+        return found, None
 
-    frames = zip(count(), animation.positions.tolist(), codes, map(bool, inside))
     # Each frame has its own deadline, because a stream may take as long as its reader takes.
     caller = replace(caller, long=True)
     with workers.stream(caller):
-        # The first frame is computed alone: in parallel with the second it would take half as long again.
-        yield await workers.piece(partial(line, next(frames)), caller)
-        async with aclosing(workers.map(line, frames, caller)) as lines:
-            async for ready in lines:
-                yield ready
+        # The first frame is computed alone: with the second it would take half as long again.
+        first = slice(0, 1)
+        rest = (slice(k, k + 1) for k in range(1, len(codes)))
+        ready, error = await workers.piece(partial(lines, first), caller)
+        for line in ready:
+            yield line
+        if error:
+            raise error
+        async with aclosing(workers.map(lines, rest, caller)) as batches:
+            async for ready, error in batches:
+                for line in ready:
+                    yield line
+                if error:
+                    raise error
 
 
 def _require_frames(animation: Animation, most: int) -> None:

@@ -19,8 +19,8 @@ from shapespace.files.point_cache import point_cache
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.files.usd import animated_usd
 from shapespace.mesh.attributes import MeshAttributes
-from shapespace.model.decoder import Diagnostics, Shape
 from shapespace.model.latent_space import Codes
+from shapespace.model.shape import Diagnostics, Shape
 from shapespace.service.use_cases.shape_formats import catch_write_errors, diagnostics_arrays, dump_json, float32
 
 

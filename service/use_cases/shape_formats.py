@@ -16,8 +16,8 @@ from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, VTK_FOR
 from shapespace.files.usd import usd_installed
 from shapespace.files.vtk_reading import vtk_installed
 from shapespace.mesh.attributes import MeshAttributes, Topology
-from shapespace.model.decoder import Diagnostics, Quality
 from shapespace.model.exact_shapes import ExactShape
+from shapespace.model.shape import Diagnostics, Quality
 
 #: Bytes in which values are counted at once; counting ends after the piece in which they exceed the limit.
 _PIECE = 2**16
@@ -141,7 +141,8 @@ def exponential_arrays(exponentials: Sequence[ExactShape], vertex_count: int) ->
 
 
 def summarise(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
-    """Summarise diagnostics: the largest numbers, the first bad status, and draft if any shape is one."""
+    """Summarise diagnostics: the largest numbers, the first bad status, and the least accurate quality."""
+    qualities = {d.quality for d in diagnostics}
     bad = [d.status for d in diagnostics if d.status != "converged"]
     return {
         "status": bad[0] if bad else diagnostics[0].status,
@@ -149,5 +150,5 @@ def summarise(diagnostics: Sequence[Diagnostics]) -> dict[str, Any]:
         "plausibility": max((d.plausibility for d in diagnostics if d.plausibility is not None), default=None),
         "inside_bounds": all(d.inside_bounds for d in diagnostics),
         "model": diagnostics[0].model,
-        "quality": Quality.DRAFT if any(d.quality is Quality.DRAFT for d in diagnostics) else Quality.FULL,
+        "quality": next(each for each in (Quality.DRAFT, Quality.AUTO, Quality.FULL) if each in qualities),
     }

@@ -105,6 +105,16 @@ class DraftError(_Strict):
     p95: NonNegativeFloat
 
 
+class AutoError(DraftError):
+    """Vertex distances between shapes of quality ``auto`` and ``full``, and how Gauss–Newton ends for ``auto``.
+
+    A shape is final after a step that moves no vertex further than ``tolerance`` times the diagonal. Null: drafts are
+    accurate enough.
+    """
+
+    tolerance: PositiveFloat | None
+
+
 class Origin(_Strict):
     """Configuration, data and code that a bundle was made from."""
 
@@ -157,6 +167,8 @@ class Manifest(_Strict):
     onnx_tolerance: Tolerance
     figures: dict[str, Any]
     draft_error: DraftError | None = None
+    #: Without it, ``auto`` answers full shapes.
+    auto_error: AutoError | None = None
     origin: Origin
     files: dict[FileName, FileEntry]
 

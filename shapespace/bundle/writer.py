@@ -23,7 +23,9 @@ from shapespace.bundle.schema import (
     MANIFEST,
     SCHEMA_VERSION,
     START,
+    AutoError,
     DecoderEntry,
+    DraftError,
     FileEntry,
     Manifest,
     Origin,
@@ -82,7 +84,8 @@ class Facts:
     origin: Origin
     exponential_steps: int | None = None
     exponential_first_step: FirstStep = "paper"
-    draft_error: Mapping[str, float] | None = None
+    draft_error: DraftError | None = None
+    auto_error: AutoError | None = None
 
 
 def require_replaceable(folder: Path, names: Iterable[str] = ()) -> None:
@@ -139,10 +142,17 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     return folder
 
 
-def add_card(folder: Path) -> None:
-    """Write the card of a bundle that has none, or whose manifest has changed; raises BundleError or OSError."""
+def amend_bundle(folder: Path, **members: Any) -> None:
+    """Replace members of the manifest of a bundle, such as ``auto_error``, and write its card, which it may not have.
+
+    Raises:
+        BundleError: there is no valid bundle. Nothing is written.
+        pydantic.ValidationError: a member is invalid. Nothing is written.
+        OSError: the folder can't be written.
+    """
     bundle = read_bundle(folder)
-    _replace(folder, read_files(folder, bundle.manifest), bundle.manifest, bundle)
+    manifest = Manifest.model_validate(bundle.manifest.model_dump(by_alias=True) | members)
+    _replace(folder, read_files(folder, bundle.manifest), manifest, bundle)
 
 
 def add_decoder(folder: Path, decoder: ExportedDecoder) -> None:
@@ -170,7 +180,7 @@ def _replace(folder: Path, files: Mapping[str, bytes], manifest: Manifest, geome
     listed = manifest.model_copy(update={"files": entries})
     text = json.dumps(listed.model_dump(by_alias=True), indent=2, ensure_ascii=False) + "\n"
     with replaced_folder(folder) as part:
-        for name, content in ({**files, MANIFEST: text.encode()}).items():
+        for name, content in {**files, MANIFEST: text.encode()}.items():
             with synced_file(part / name) as file:
                 file.write(content)
 
@@ -186,7 +196,7 @@ def _manifest(facts: Facts, geometry: Geometry, files: Mapping[str, bytes]) -> M
     same += ["exponential_steps", "exponential_first_step"]
     return Manifest.model_validate({
         "schema_version": SCHEMA_VERSION,
-        **{name: getattr(facts, name) for name in (*same, "draft_error", "origin")},
+        **{name: getattr(facts, name) for name in (*same, "draft_error", "auto_error", "origin")},
         "latent_dimension": len(facts.lower),
         "latent_names": list(facts.latent_names),
         "factors": [

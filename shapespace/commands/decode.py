@@ -25,8 +25,9 @@ from shapespace.commands.parameters import (
     require_writable,
     write,
 )
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds, Codes, Distribution
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import load
 from shapespace.solve.outcome import Status
 
@@ -57,7 +58,7 @@ PARAMS = (
         help="seed of the random codes; the same seed gives the same codes",
     ),
     choice("--distribution", Distribution, f"distribution of the random codes (default: {Distribution.UNIFORM})"),
-    choice("--quality", Quality, "accuracy of the shapes"),
+    choice("--quality", Quality, f"accuracy of the shapes (default: {Quality.AUTO})"),
     choice("--bounds", Bounds, f"what happens to codes outside the bounds (default: {Bounds.ALLOW})"),
     choice("--mesh", MeshChoice, f"mesh of the shapes (default: {MeshChoice.FINE})"),
     click.Option(["--format"], metavar="FORMAT", help=f"{', '.join(FORMATS)} (default: extension of --out, or glb)"),

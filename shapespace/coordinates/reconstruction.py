@@ -26,6 +26,8 @@ DEFAULT_ETA = 1e-2
 #: Largest relative misfit of a draft. Within the bounds of the bundled models the misfit of a shape from face frames is
 #: 0.004 (figure) to 0.16 (torus). Beyond 0.2 such shapes are off by several percent of their size.
 LARGEST_DRAFT_MISFIT = 0.2
+#: Largest number of iterations for one shape.
+MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,16 +88,23 @@ class Reconstructor:
             return integrated
         return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
 
-    def draft(self, target: FloatArray) -> Reconstruction | None:
-        """Return the shape from face frames, without iterating.
+    def draft(
+        self, target: FloatArray, tolerance: float | None = None, deadline: Deadline | None = None
+    ) -> Reconstruction | None:
+        """Return the shape from face frames; with a tolerance improved by Gauss–Newton.
 
-        Its distance to the reconstructed shape grows with the distance between z* and integrable coordinates. Returns
-        None if its misfit exceeds LARGEST_DRAFT_MISFIT or a face is folded over.
+        The distance of a draft to the reconstructed shape grows with the distance between z* and integrable
+        coordinates. Gauss–Newton ends once a step moves no vertex further than ``tolerance`` times the reference's
+        diagonal; the shape itself is usually closer. Returns None if the misfit of the draft exceeds
+        LARGEST_DRAFT_MISFIT, a face is folded over, or Gauss–Newton stalls.
         """
         found = self._squares(self.integrate(target), target)
         residual, flipped = float(np.sqrt(found.energy / self.norm.square(target))), self._flipped(found.misfit)
         if not residual <= LARGEST_DRAFT_MISFIT or flipped:
             return None
+        if tolerance is not None:
+            improved = self._iterate(target, found, tolerance, MAX_ITERATIONS, deadline)
+            return None if improved.status is Status.STALLED else improved
         return Reconstruction(
             vertices=found.vertices, status=Status.CONVERGED, residual=residual, flipped_faces=flipped
         )
@@ -117,7 +126,7 @@ class Reconstructor:
         start: FloatArray | None = None,
         *,
         tolerance: float = 1e-8,
-        max_iterations: int = 200,
+        max_iterations: int = MAX_ITERATIONS,
         deadline: Deadline | None = None,
     ) -> Reconstruction:
         """Reconstruct one shape from a given start.
@@ -133,12 +142,12 @@ class Reconstructor:
         target: FloatArray,
         *others: Callable[[], FloatArray],
         tolerance: float = 1e-8,
-        max_iterations: int = 200,
+        max_iterations: int = MAX_ITERATIONS,
         deadline: Deadline | None = None,
     ) -> Reconstruction:
         """Reconstruct one shape from ``guess``, without computing the misfit of the guess twice.
 
-        If that stalls, the other starts and the reference are tried, each with the same limit of iterations. A bad
+        If that stalls, the other starts and the reference are tried, while iterations are left. A bad
         guess may lead to a face that degenerates, where a smaller misfit lies beyond the degeneration. Exceptions of
         the other starts are passed on.
         """
@@ -151,7 +160,8 @@ class Reconstructor:
         for other in starts:
             if np.array_equal(start := other(), guess.vertices):
                 continue
-            again = self._iterate(target, self._squares(start, target), tolerance, max_iterations, deadline)
+            left = max_iterations - iterations
+            again = self._iterate(target, self._squares(start, target), tolerance, left, deadline)
             iterations += again.iterations
             if again.converged or again.status is Status.DEADLINE:
                 return replace(again, iterations=iterations)

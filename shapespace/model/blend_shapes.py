@@ -9,8 +9,9 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.animated_gltf import blend_shapes_glb
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.shape import Shape
 
 #: Number of random codes by which the error is measured.
 MEASURED = 40

@@ -4,9 +4,8 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -17,13 +16,14 @@ from shapespace.bundle.geometry import FineMesh
 from shapespace.bundle.reader import Bundle, BundleError
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
-from shapespace.coordinates.reconstruction import Reconstructor
+from shapespace.coordinates.reconstruction import MAX_ITERATIONS, Reconstructor
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
 from shapespace.model.population import Population
+from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
@@ -37,8 +37,15 @@ TOLERANCE = 2e-5
 LEAST_PATIENCE, RECOVERY = 0.5, 1.1
 #: Number of random codes in the self-test.
 TESTED_CODES = 2
-#: Number of random codes by which the error of drafts is measured.
-DRAFT_CODES = 50
+#: Networks run for several codes at once, with at most this number of edges together. More take longer for each code,
+#: because the numbers no longer fit into the processor's cache.
+BATCH_EDGES = 24_000
+#: Most iterations for ``auto`` outside the bounds, so that an answer takes less than a second. Codes up to one and a
+#: half times the bounds need fewer; further away most shapes have flipped faces, whatever the number.
+ITERATIONS_OUTSIDE = 60
+#: Largest share of triangles whose predicted sides can't form a triangle. Inside the bounds of the bundled models there
+#: are none. Beyond a tenth, a third of the faces of the solved shape are flipped.
+BROKEN_TRIANGLES = 0.1
 
 
 class ModelFailedError(RuntimeError):
@@ -54,58 +61,6 @@ class MeshChoice(StrEnum):
 
     FINE = "fine"
     COARSE = "coarse"
-
-
-class Quality(StrEnum):
-    """Accuracy of a shape: by Gauss–Newton, or from face frames alone in a fraction of the time."""
-
-    FULL = "full"
-    DRAFT = "draft"
-
-
-@dataclass(frozen=True)
-class Diagnostics:
-    """Diagnostics of a decoded shape.
-
-    Attributes:
-        status: how Gauss–Newton ended; ``converged`` for a draft, which needs no Gauss–Newton.
-        iterations: number of Gauss–Newton steps.
-        residual: relative difference of the shape's lengths and angles from the networks' prediction, in the weighted
-            norm.
-        flipped_faces: number of faces at an edge whose dihedral angle differs by more than π/2 from the prediction.
-        integrability: distance of the prediction from the lengths and angles of any surface: root mean square over
-            vertices of ``|Q(z)|``, the sine of half the angle by which faces around a vertex fail to close.
-        plausibility: distance from the nearest training code, in multiples of the typical distance between training
-            codes; None if the model has no training codes.
-        inside_bounds: whether the code lies inside the model's bounds.
-        model: digest of the model's manifest.
-        quality: whether the shape is a draft.
-    """
-
-    status: Status
-    iterations: int
-    residual: float
-    flipped_faces: int
-    integrability: float
-    plausibility: float | None
-    inside_bounds: bool
-    model: str
-    quality: Quality = Quality.FULL
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Decoded shape, aligned to the reference, in the units of the training meshes.
-
-    Attributes:
-        vertices: (V, 3) vertices of the requested mesh.
-        diagnostics: diagnostics, which concern the coarse mesh.
-        seconds: time in seconds by stage, ``network`` and ``reconstruct``.
-    """
-
-    vertices: FloatArray
-    diagnostics: Diagnostics
-    seconds: dict[str, float] = field(compare=False)
 
 
 class Decoder:
@@ -130,6 +85,8 @@ class Decoder:
             f"The code lies so far outside the bounds that the model's numbers overflow. Choose a code "
             f'nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
         )
+        #: Tolerance of the quality ``auto``, and its measured error; None if ``auto`` answers full shapes.
+        self.auto = manifest.auto_error
         codes = self.training_codes = bundle.training_codes
         self._training = None if codes is None else TrainingCodes(self.latents, codes)
         #: Distribution of codes: of the training codes, or of uniform codes if there are no training codes.
@@ -186,19 +143,64 @@ class Decoder:
         """Decode one code (m,), even if Gauss–Newton does not converge: the diagnostics say so.
 
         A draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless. After the
-        deadline Gauss–Newton stops with Status.DEADLINE. ``inside_bounds`` is for the diagnostics.
+        deadline Gauss–Newton stops with Status.DEADLINE. Outside the bounds ``auto`` takes at most ITERATIONS_OUTSIDE.
 
-        Raises NotFiniteError if the code is so far outside the bounds that numbers overflow, and ModelFailedError if
-        the networks failed at this code, or took too long.
+        Raises NotFiniteError if the code is so far outside the bounds that numbers overflow or the predicted lengths
+        form no surface, and ModelFailedError if the networks failed at this code, or took too long.
         """
+        return next(self.shapes(code[None], [inside_bounds], mesh, deadline, quality))
+
+    def batches(self, codes: Codes, quality: Quality) -> Iterator[slice]:
+        """Yield ranges of codes (n, m) for which networks run at once: in a third to all of the time of single codes.
+
+        Sums in another order change the last digits, so full shapes are computed one by one.
+        """
+        size = 1 if quality is Quality.FULL else max(1, BATCH_EDGES // self.manifest.edges)
+        return (slice(k, k + size) for k in range(0, len(codes), size))
+
+    def shapes(
+        self,
+        codes: Codes,
+        inside_bounds: Sequence[bool] | NDArray[np.bool_],
+        mesh: MeshChoice = MeshChoice.FINE,
+        deadline: Deadline | None = None,
+        quality: Quality = Quality.FULL,
+    ) -> Iterator[Shape]:
+        """Decode codes (n, m) one after another; see `shape` and `batches`."""
+        for some in self.batches(codes, quality):
+            began = time.perf_counter()
+            targets = self._networks(codes[some])[1]
+            seconds = (time.perf_counter() - began) / len(targets)
+            for code, target, inside in zip(codes[some], targets, inside_bounds[some], strict=True):
+                yield self._solved(code, target, bool(inside), mesh, deadline, quality, seconds)
+
+    def _solved(
+        self,
+        code: Codes,
+        target: FloatArray,
+        inside_bounds: bool,
+        mesh: MeshChoice,
+        deadline: Deadline | None,
+        quality: Quality,
+        predicting: float,
+    ) -> Shape:
+        """Solve for the shape of one code (m,), whose lengths and angles (2E,) took ``predicting`` seconds."""
         began = time.perf_counter()
-        _, target = self._networks(code[None])
-        predicted = time.perf_counter()
+        self._require_triangles(target)
+        if quality is Quality.AUTO and self.auto is None:
+            quality = Quality.FULL
+        found = None
         with self.solver() as reconstruct:
-            draft = reconstruct.draft(target[0]) if quality is Quality.DRAFT else None
-            found = draft or reconstruct.from_guess(
-                target[0], *self._learned_start(code), tolerance=TOLERANCE, deadline=deadline
-            )
+            if quality is not Quality.FULL:
+                tolerance = self.auto.tolerance if self.auto and quality is Quality.AUTO else None
+                found = reconstruct.draft(target, tolerance, deadline)
+            if found is None:
+                quality = Quality.FULL if quality is Quality.DRAFT else quality
+                limit = MAX_ITERATIONS if inside_bounds or quality is Quality.FULL else ITERATIONS_OUTSIDE
+                starts = self._learned_start(code)
+                found = reconstruct.from_guess(
+                    target, *starts, tolerance=TOLERANCE, max_iterations=limit, deadline=deadline
+                )
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 vertices = self.finish(found.vertices, mesh)
@@ -211,26 +213,14 @@ class Decoder:
             found.iterations,
             found.residual,
             found.flipped_faces,
-            float(np.sqrt((self._integrability.at_vertices(target[0]) ** 2).sum(axis=1).mean())),
+            float(np.sqrt((self._integrability.at_vertices(target) ** 2).sum(axis=1).mean())),
             self._training.plausibility(code) if self._training else None,
             inside_bounds,
             self.digest,
-            Quality.DRAFT if draft else Quality.FULL,
+            quality,
         )
-        seconds = {"network": predicted - began, "reconstruct": time.perf_counter() - predicted}
+        seconds = {"network": predicting, "reconstruct": time.perf_counter() - began}
         return Shape(vertices, diagnostics, seconds)
-
-    def draft_error(self) -> dict[str, float]:
-        """Return ``mean`` and ``p95`` of the distance between drafts and full shapes, over vertices and random codes.
-
-        Distances are shares of the reference's diagonal; codes are uniform inside the bounds. Where frames are
-        inconsistent, a draft is the full shape. Raises NotFiniteError or ModelFailedError.
-        """
-        size, away = self.manifest.scale * self.mesh(MeshChoice.FINE).diagonal, []
-        for code in self.latents.sample(DRAFT_CODES, 0, Distribution.UNIFORM):
-            draft, full = (self.shape(code, quality=quality).vertices for quality in (Quality.DRAFT, Quality.FULL))
-            away.append(np.linalg.norm(draft - full, axis=1) / size)
-        return {"mean": float(np.mean(away)), "p95": float(np.percentile(away, 95))}
 
     def lengths_and_angles(self, code: Codes) -> tuple[FloatArray, FloatArray]:
         """Return edge lengths and dihedral angles in radians (2E,) that the networks predict for a code (m,).
@@ -323,6 +313,19 @@ class Decoder:
             ]
             factors = np.stack(parts, axis=1)
             return factors, self._combiner(factors, until).astype(np.float64)
+
+    def _require_triangles(self, target: FloatArray) -> None:
+        """Raise NotFiniteError if too many triangles of a prediction (2E,) can't exist, see BROKEN_TRIANGLES."""
+        a, b, c = target.take(self.reference.connectivity.face_sides)
+        # Also false for NaN, which Gauss–Newton reports.
+        broken = (a + b <= c) | (b + c <= a) | (c + a <= b)
+        if broken.mean() > BROKEN_TRIANGLES:
+            raise NotFiniteError(
+                f"The code lies so far outside the bounds that no surface has the predicted lengths: "
+                f"{broken.mean():.0%} of the triangles would have a side longer than the other two together. "
+                f"Choose a code nearer to the bounds, which the card of {self.manifest.name} lists, or send "
+                f'"bounds": "clamp".'
+            )
 
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
         if self._start:

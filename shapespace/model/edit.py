@@ -9,12 +9,13 @@ import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.edit_search import SETTINGS, EditSearch
 from shapespace.model.latent_space import Bounds, Codes, NotFiniteError
 from shapespace.model.options import EditOptions, Target
 from shapespace.model.posterior import Posterior
 from shapespace.model.pulled_vertices import PulledVertices
+from shapespace.model.shape import Shape
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 

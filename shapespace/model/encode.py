@@ -11,7 +11,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import nric
 from shapespace.mesh.rigid_motion import Placement, align, aligned_change
 from shapespace.model.correspondence import InvalidMeshError, Matched
-from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.derivatives import derivatives
 from shapespace.model.encode_faults import (
     THRESHOLDS,
@@ -27,6 +27,7 @@ from shapespace.model.encode_search import EncodePreparation, EncodeSearch, Vert
 from shapespace.model.latent_space import Codes, Fixed, NotFiniteError
 from shapespace.model.options import EncodeOptions, Objective
 from shapespace.model.posterior import Posterior, independent_share, patches_of
+from shapespace.model.shape import Shape
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status

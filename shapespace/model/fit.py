@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import Decoder, MeshChoice, Shape
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.feature_search import FeatureSearch
 from shapespace.model.fit_constraints import FitConstraints
 from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted, VertexDerivatives
@@ -24,6 +24,7 @@ from shapespace.model.placement import QUICK, THOROUGH, PlacementEffort, StartPl
 from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
 from shapespace.model.searched_shapes import SearchedShapes
+from shapespace.model.shape import Shape
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status

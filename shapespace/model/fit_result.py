@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import MeshChoice, Shape
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Codes
+from shapespace.model.shape import Shape
 
 
 class FitStatus(StrEnum):

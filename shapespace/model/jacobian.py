@@ -7,10 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.model.decoder import TOLERANCE, Decoder, MeshChoice, Quality
+from shapespace.model.decoder import TOLERANCE, Decoder, MeshChoice
 from shapespace.model.derivatives import carried
 from shapespace.model.latent_space import Codes, LatentError
 from shapespace.model.network_program import NetworkProgram, NumPyOperations
+from shapespace.model.shape import Quality
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 
 #: Share of the usual tolerance to which the shape is solved: the derivative is that of the exact minimum.

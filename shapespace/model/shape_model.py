@@ -18,7 +18,7 @@ from shapespace.bundle.reader import Bundle, BundleError, manifest_digest, read_
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.blend_shapes import BlendShapes, blend_shapes
 from shapespace.model.correspondence import Matched
-from shapespace.model.decoder import Decoder, MeshChoice, Quality, Shape
+from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.edit import Edited, edited
 from shapespace.model.encode import Encoded, Encoder
 from shapespace.model.fit import Fitter
@@ -27,6 +27,7 @@ from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched,
 from shapespace.model.jacobian import NetworkDerivatives, shape_jacobian
 from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
+from shapespace.model.shape import Quality, Shape
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
 from shapespace.solve.blas_threads import OneBlasThread
 from shapespace.solve.deadline import Deadline
@@ -35,7 +36,7 @@ from shapespace.solve.outcome import Status
 # Enumerations with their values, so that callers may write plain strings.
 MeshName = MeshChoice | Literal["fine", "coarse"]
 BoundsName = Bounds | Literal["allow", "clamp", "reject"]
-QualityName = Quality | Literal["full", "draft"]
+QualityName = Quality | Literal["auto", "full", "draft"]
 DistributionName = Distribution | Literal["uniform", "gaussian", "population"]
 
 
@@ -142,7 +143,7 @@ class ShapeModel:
         inside_bounds: bool = True,
         mesh: MeshName = "fine",
         deadline: Deadline | None = None,
-        quality: QualityName = "full",
+        quality: QualityName = "auto",
     ) -> Shape:
         """Return the shape of one checked code (m,) with its diagnostics, even if Gauss–Newton did not converge.
 
@@ -151,10 +152,10 @@ class ShapeModel:
             inside_bounds: whether the code lies inside the bounds, for the diagnostics.
             mesh: "fine" or "coarse".
             deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
-            quality: "full", or "draft", which leaves Gauss–Newton out where the first guess is near enough.
+            quality: "auto"; "full" for the converged solution; or "draft", which leaves Gauss–Newton out. See Quality.
 
         Raises:
-            LatentError: the code is so far outside the bounds that numbers overflow.
+            LatentError: the code is so far outside the bounds that it has no shape.
             ModelFailedError: the networks failed at this code, or took too long.
 
         >>> import shapespace
@@ -168,7 +169,7 @@ class ShapeModel:
 
     @OneBlasThread()
     def decode(
-        self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "full"
+        self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "auto"
     ) -> FloatArray:
         """Return the shapes of codes.
 
@@ -178,13 +179,14 @@ class ShapeModel:
             codes: codes (n, m), or one code (m,).
             mesh: "fine" or "coarse"; a model without a finer mesh returns its only mesh for both.
             bounds: "allow" extrapolates outside the bounds, "clamp" moves to the nearest bound, "reject" refuses.
-            quality: "full", or "draft", which leaves Gauss–Newton out where the first guess is near enough.
+            quality: "auto"; "full" for the converged solution; or "draft", which leaves Gauss–Newton out. See Quality.
 
         Returns:
             Positions (n, V, 3), or (V, 3) for one code.
 
         Raises:
-            LatentError: a code has the wrong length, is not finite, or lies outside the bounds with "reject".
+            LatentError: a code has the wrong length, is not finite, lies outside the bounds with "reject", or is so
+                far outside the bounds that it has no shape.
             ModelFailedError: the networks failed at a code, or took too long.
 
         >>> import numpy as np, shapespace
@@ -200,8 +202,7 @@ class ShapeModel:
         checked, inside = self.latents.codes(np.atleast_2d(values), Bounds(bounds))
         positions = np.empty((len(checked), *self.mesh(choice).vertices.shape))
         ended = []
-        for k, code in enumerate(checked):
-            shape = self.shape(code, bool(inside[k]), choice, quality=Quality(quality))
+        for k, shape in enumerate(self.decoder.shapes(checked, inside, choice, quality=Quality(quality))):
             positions[k] = shape.vertices
             ended.append(shape.diagnostics.status)
         missed = [k for k, status in enumerate(ended) if status is not Status.CONVERGED]
@@ -266,7 +267,7 @@ class ShapeModel:
         b'glTF'
         """
         choice = MeshChoice(mesh)
-        return blend_shapes(self.decoder, choice, lambda code: self.shape(code, mesh=choice))
+        return blend_shapes(self.decoder, choice, lambda code: self.shape(code, mesh=choice, quality=Quality.FULL))
 
     @OneBlasThread()
     def encode(

@@ -121,6 +121,11 @@ TESTS = {
             "coverage report --include 'shapespace/service/*' --fail-under 90",
         ),
     ),
+    "quality": LongTest(
+        "compare shapes of quality `auto` and `full` with exact shapes, at 1000 codes of each bundled model",
+        ("shapespace/model", "shapespace/coordinates", "shapespace/bundle", "models"),
+        (f"{MARKED} tests/service/calls/test_quality.py",),
+    ),
     "page": LongTest("the slow tests of the page in Chromium", ("service/page",), (f"{MARKED} tests/page",)),
     "firefox": LongTest(
         "try the page in Firefox, by WebDriver BiDi (Debian: firefox-esr, xvfb, libegl1 and libgl1-mesa-dri)",

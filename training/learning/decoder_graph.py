@@ -26,8 +26,9 @@ from shapespace.arrays import FloatArray
 from shapespace.bundle.reader import Bundle
 from shapespace.bundle.schema import DECODER, DecoderEntry
 from shapespace.bundle.writer import ExportedDecoder
-from shapespace.model.decoder import Decoder, Quality
+from shapespace.model.decoder import Decoder
 from shapespace.model.latent_space import Codes, Distribution
+from shapespace.model.shape import Quality
 from shapespace.torch.layer import VerticesFromNRIC
 from shapespace.training.learning import ExportError
 

@@ -19,6 +19,7 @@ from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance, factor_network
 from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.model.accuracy import measure_accuracy
 from shapespace.model.decoder import Decoder, ModelFailedError
 from shapespace.model.latent_space import NotFiniteError
 from shapespace.shell.energy import Material
@@ -144,11 +145,12 @@ def export(
         origin=Origin(config=_portable(config), data_digest=data_digest, code_version=metadata.version("shapespace")),
     )
     try:
-        # Drafts are measured as they are served, which needs a bundle: a first one in a temporary folder.
+        # Shapes are measured as they are served, which needs a bundle: a first one in a temporary folder.
         with TemporaryDirectory() as folder:
             first = write_bundle(Path(folder), facts, networks, geometry)
             decoder = Decoder(read_bundle(first))
-            facts = replace(facts, draft_error=decoder.draft_error())
+            accuracy = measure_accuracy(decoder)
+            facts = replace(facts, draft_error=accuracy.draft_error, auto_error=accuracy.auto_error)
             if settings.decoder:
                 networks = replace(networks, decoder=decoder_graph(read_bundle(first), decoder))
         return write_bundle(models, facts, networks, geometry)

@@ -13,8 +13,9 @@ from pydantic import Field, TypeAdapter, WithJsonSchema, model_validator
 from shapespace.files.colouring import Quantity
 from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds, CheckedCode
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.dependencies import Format, one_of

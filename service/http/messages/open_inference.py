@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages.schemas import BoundsField, QualityField
 from shapespace.service.http.problems import ProblemError
@@ -93,7 +94,7 @@ class InferenceParameters(_Message):
         MeshChoice.FINE, description="The mesh whose vertices are answered, if the model has a fine one."
     )
     bounds: BoundsField = Bounds.ALLOW
-    quality: QualityField = Quality.FULL
+    quality: QualityField = Quality.AUTO
 
 
 class InferenceRequest(_Message):

@@ -8,10 +8,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from shapespace.bundle.schema import AttributesEntry
 from shapespace.files.colouring import Quantity
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.encode_faults import EncodeCause
 from shapespace.model.latent_space import Bounds, Distribution
 from shapespace.model.options import EditOptions, EncodeOptions, Target
+from shapespace.model.shape import Quality
 from shapespace.service.http.messages.options import body_of, query_of
 from shapespace.service.use_cases.fields import Body, Number, Whole
 
@@ -38,8 +39,10 @@ MeshField = Annotated[MeshChoice, Field(description="Which mesh to answer, if th
 QualityField = Annotated[
     Quality,
     Field(
-        description="`draft` leaves out Gauss–Newton if the first guess is accurate enough, and takes about half the "
-        "time. The card's `draft_error` is the error. `Shape-Diagnostics.quality` says which quality was answered."
+        description="`auto` stops Gauss–Newton where more steps would not bring the shape closer to the exact one: it "
+        "is at most 1.1 times as far away as `full`. `full` solves to convergence. `draft` leaves out Gauss–Newton if "
+        "the first guess is accurate enough. The card's `auto_error` and `draft_error` are the distances from `full`. "
+        "`Shape-Diagnostics.quality` says which quality was answered."
     ),
 ]
 BoundsField = Annotated[
@@ -57,7 +60,7 @@ class MeshRequest(Body):
     latent: Latent
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
-    quality: QualityField = Quality.FULL
+    quality: QualityField = Quality.AUTO
     covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
         None, description="With `?color=spread`: m × m covariance of the code, as `edit`, `encode` and `fit` answer it."
     )
@@ -74,7 +77,7 @@ class VerticesRequest(Body):
     )
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
-    quality: QualityField = Quality.FULL
+    quality: QualityField = Quality.AUTO
     faces: bool = Field(True, strict=True, description="Whether NPZ has the faces too. JSON never has them.")
 
 
@@ -166,7 +169,7 @@ class DiagnosticsAnswer(BaseModel):
     )
     inside_bounds: bool = Field(description="Whether the code lies inside the model's bounds.")
     model: str = Field(description="SHA-256 of the model's manifest.")
-    quality: Quality = Field(description="`draft` if Gauss–Newton was left out, otherwise `full`.")
+    quality: Quality = Field(description="The quality that was answered.")
 
 
 class VertexError(BaseModel):
@@ -360,6 +363,9 @@ class ModelCard(ModelSummary):
     )
     draft_error: DistanceAnswer | None = Field(
         description="Distance of drafts from full shapes, over codes inside the bounds; null if it was not measured."
+    )
+    auto_error: DistanceAnswer | None = Field(
+        description="Distance of shapes of quality `auto` from full shapes, likewise; null if it was not measured."
     )
     origin: dict[str, Any]
 

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
-from shapespace.model.decoder import Quality
+from shapespace.model.shape import Quality
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
     CallerDependency,
@@ -88,7 +88,7 @@ async def get_interpolation(
     request: Request,
     caller: CallerDependency,
     id: Id,
-    quality: QualityQuery = Quality.FULL,
+    quality: QualityQuery = Quality.AUTO,
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
@@ -137,7 +137,7 @@ async def get_frame(
     id: Id,
     k: Annotated[int, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
     options: FrameQuery,
-    quality: QualityQuery = Quality.FULL,
+    quality: QualityQuery = Quality.AUTO,
 ) -> Response:
     """One frame of an animation in any mesh format."""
     animation, model = find_interpolation(service.repository, id, service.settings.max_frames)

@@ -6,8 +6,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
+from shapespace.model.shape import Quality
 from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import (
     CallerDependency,
@@ -59,7 +60,7 @@ async def get_mesh(
         MeshChoice, Query(description="Which mesh to answer, if the model has a fine one.")
     ] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
-    quality: QualityQuery = Quality.FULL,
+    quality: QualityQuery = Quality.AUTO,
 ) -> Response:
     """The shape of a code as a mesh file, by an address for links and browsers."""
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)

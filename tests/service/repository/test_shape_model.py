@@ -10,8 +10,9 @@ from onnx import numpy_helper
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
-from shapespace.model.decoder import TOLERANCE, MeshChoice, Quality
+from shapespace.model.decoder import TOLERANCE, MeshChoice
 from shapespace.model.latent_space import NotFiniteError
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.use_cases.shape_formats import summarise
 from shapespace.solve.outcome import Status

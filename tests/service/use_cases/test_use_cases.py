@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.model.decoder import MeshChoice, Quality
+from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import BusyError, Caller, Workers
 from shapespace.service.use_cases import batch, many_shapes

@@ -9,7 +9,7 @@ import yaml
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import CARD, MANIFEST
-from shapespace.bundle.writer import add_card
+from shapespace.bundle.writer import amend_bundle
 from shapespace.model.shape_model import load
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT
@@ -50,7 +50,7 @@ def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> N
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     code = [0.1] * 20
     shape = load(folder).decode(code, mesh="coarse")
-    add_card(folder)
+    amend_bundle(folder)
     after = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert {name for name in after if after[name] != before.get(name)} == {CARD, MANIFEST}
     assert (load(folder).decode(code, mesh="coarse") == shape).all()
@@ -58,14 +58,14 @@ def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> N
     assert (head["license"], head["license_name"]) == ("other", "all-rights-reserved")
     assert "metrics" not in head
     assert "# Left\\|right --- x: y\n" in text
-    add_card(folder)
+    amend_bundle(folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == after
 
 
 def test_the_card_of_the_figure_has_its_figures(tmp_path: Path) -> None:
     folder = tmp_path / "figure" / "3"
     shutil.copytree(ROOT / "models" / "figure" / "3", folder)
-    add_card(folder)
+    amend_bundle(folder)
     head, text = head_and_text(folder)
     assert head["metrics"] == ["r_squared", "vertex_error"]
     manifest = json.loads((folder / MANIFEST).read_text())

@@ -17,6 +17,7 @@ import shapespace
 from benchmarks.studies import ShareLearner
 from shapespace.bundle.reader import read_bundle
 from shapespace.coordinates.nric import WeightedNorm, nric
+from shapespace.model.accuracy import measure_accuracy
 from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.generators.freaky_torus import FreakyTorus, vertices
 from shapespace.training.learning.evaluation import r_squared
@@ -82,8 +83,10 @@ def test_the_bundle_is_one_the_server_takes_and_computes_the_same(tiny_run: Path
     bundle = read_bundle(folder)
     assert bundle.manifest.figures == json.loads((tiny_run / "evaluation.json").read_text())
     assert bundle.manifest.onnx_tolerance.measured <= 1e-4
+    measured = measure_accuracy(ShapeModel(bundle).decoder)
+    assert bundle.manifest.auto_error == measured.auto_error
     assert bundle.manifest.draft_error
-    assert bundle.manifest.draft_error.model_dump() == pytest.approx(ShapeModel(bundle).decoder.draft_error(), rel=1e-6)
+    assert bundle.manifest.draft_error.model_dump() == pytest.approx(measured.draft_error.model_dump(), rel=1e-6)
     text = b"".join(path.read_bytes() for path in folder.iterdir())
     assert str(Path(__file__).parents[3]).encode() not in text, "a bundle has no paths of its machine"
 
