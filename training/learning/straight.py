@@ -56,7 +56,10 @@ class LengthsAndAngles(nn.Module):
         edge, to_right = head - tail, right - tail
         left_normal, right_normal = _cross(edge, left - tail), _cross(to_right, edge)
         sine = -(left_normal * to_right).sum(dim=2) * edge.square().sum(dim=2).sqrt()
-        angles = torch.atan2(sine, (left_normal * right_normal).sum(dim=2))
+        cosine = (left_normal * right_normal).sum(dim=2)
+        # Half the angle, by operators with derivatives in every program that reads the file. A flat fold has no sign.
+        size = (sine.square() + cosine.square()).sqrt()
+        angles = 2 * torch.atan(sine / (cosine + size + 1e-30))
         return torch.cat([lengths, nn.functional.pad(angles, (0, 1))[:, self.slots]], dim=1)
 
 

@@ -62,6 +62,10 @@ def test_a_straight_line_model_is_served_without_training(
             served = model.decode(code)
             expected = align(scale * lines.shape(code)[0], served)
             assert np.abs(served - expected).max() < 1e-4 * size
+    code = 0.3 * run.collection.upper
+    step = 1e-3 * np.eye(2)[0]
+    slope = (align(model.decode(code + step), model.decode(code - step)) - model.decode(code - step)) / 2e-3
+    assert np.abs(model.jacobian(code)[..., 0] - slope).max() < 0.05 * np.abs(slope).max()
     figures = run.directory.evaluation.read()
     assert figures["r2"]["composite"]["total"] > (0.999 if geometry == "vertices" else 0.99)
     assert {"components", "remembering_components", "linear_nric"} <= figures["generalisation"].keys()
