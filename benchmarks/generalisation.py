@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks import pages
+from benchmarks.differential_coordinates import DifferentialCoordinates
 from benchmarks.pages import ROOT
 from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, SYMMETRIC, open_run
-from shapespace.training.space.generalisation import LIGHT_STEPS, folds, held_out, summary
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.space.generalisation import LIGHT_STEPS, folds, summary, vertex_distances
+from shapespace.training.space.held_out import held_out, simple_models
 from shapespace.training.stages.ingest import ingest
 
 #: Stored figures, one file for each collection.
@@ -34,6 +39,18 @@ For poses of hands and of the figure, modes leave much less than as many princip
 The error is the mean distance of a vertex from its place, in percent of the
 [diagonal](../reference/glossary.md#diagonal). The [ratio](../reference/glossary.md#ratio) is the error of modes divided
 by the error of components. Each collection has two rows: with half of its modes and with all.
+
+## Stronger simple models
+
+{simple}
+
+Each figure is the error as a share of the error of principal components. All models have the same folds, meshes and
+number of coordinates, and find codes by vertices.
+
+- *Components with memory* correct their errors at the training shapes, as our bundles do.
+- *Straight lines of lengths and angles* are principal components of these, with vertices by Gauss–Newton. A run chooses
+  them [where they are best](../explanation/choosing.md#map-from-codes-to-shapes).
+- *Differential coordinates* are principal components of rotations and stretches of faces. They need one Poisson solve.
 
 ## With mirror images
 
@@ -58,6 +75,8 @@ is to the components that know these images too.
 - `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles, are
   in `runs/folds/`.
 """
+#: Simple models beside principal components.
+SIMPLE = ("remembering_components", "linear_nric", "differential_coordinates")
 #: Rows of the table.
 ROWS = tuple(
     name + ending for name in (*COLLECTIONS, MANNEQUIN) for ending in ("", MIRRORED) if name in SYMMETRIC or not ending
@@ -71,8 +90,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     if not run.shapes.exists():
         run.folder.mkdir(parents=True, exist_ok=True)
         ingest(opened)
-    reference, given = run.reference_mesh(), run.shapes.read()
-    shapes, original, own = given["vertices"], given["original"], run.own_shapes()
+    reference, shapes, original, own = read_shapes(run)
     m = config.modes.count
     counts = None if m == "auto" else [-(-m // 2), m]
     every = []
@@ -101,6 +119,54 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     }
 
 
+def read_shapes(run: RunDirectory) -> tuple[TriangleMesh, FloatArray, IntArray, FloatArray]:
+    """Read the reference, all shapes (n, V, 3), the index (n,) of each shape's original, and the originals."""
+    given = run.shapes.read()
+    return run.reference_mesh(), given["vertices"], given["original"], run.own_shapes()
+
+
+def measure_simple(name: str, data: Path, out: Path, counts: list[float]) -> dict[str, Any]:
+    """Return figures of simple models of a collection, by number of coordinates, in the same folds and meshes."""
+    opened = open_run(name, data, out)
+    run = opened.directory
+    if not run.shapes.exists():
+        run.folder.mkdir(parents=True, exist_ok=True)
+        ingest(opened)
+    reference, shapes, original, own = read_shapes(run)
+    every = []
+    for k, index in enumerate(folds(len(own))):
+        file = run.study(f"simple-fold-{k}")
+        if not file.exists():
+            known = np.flatnonzero(~np.isin(original, index))
+            models = simple_models(reference, shapes[known], original[known] == known)
+            models["differential_coordinates"] = DifferentialCoordinates(shapes[known], reference).nearest
+            unseen = shapes[index]
+            file.write({
+                kind: [
+                    vertex_distances(nearest(unseen, round(count)), unseen, reference.diagonal).tolist()
+                    for count in counts
+                ]
+                for kind, nearest in models.items()
+            })  # fmt: skip
+            print(name, "simple models", k, flush=True)
+        every.append(file.read())
+    return {
+        kind: [summary(np.concatenate(some)) for some in zip(*(fold[kind] for fold in every), strict=True)]
+        for kind in SIMPLE
+        if all(kind in fold for fold in every)
+    }
+
+
+def simple_rows(name: str, found: dict[str, Any]) -> list[list[str]]:
+    """Return the rows of a collection: the error of each model as a share of the error of principal components."""
+    title = f"{name}, K = {', '.join(map(str, found['steps']))}"
+    return [
+        [f"{title}, {count} modes"]
+        + [f"{found[kind][k]['mean'] / found['components'][k]['mean']:.2f}" for kind in ("modes", *SIMPLE)]
+        for k, count in enumerate(found["counts"])
+    ]
+
+
 def rows(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[list[str]]:
     """Return the rows of a collection: modes beside components, for each number of modes; the ratio is to the first."""
     result: list[list[str]] = []
@@ -116,8 +182,13 @@ def write_page() -> None:
     """Write the page from all stored figures."""
     done = {each: pages.read_figures(path) for each in ROWS if (path := FIGURES / f"{each}.json").exists()}
     plain = {name: found for name, found in done.items() if not name.endswith(MIRRORED)}
+    simple = {name: found for name, found in plain.items() if found.keys() >= set(SIMPLE)}
     images = {name.removesuffix(MIRRORED): found for name, found in done.items() if "mirrored_components" in found}
     page = PAGE.format(
+        simple=pages.table(
+            ("", "modes", "components with memory", "straight lines of lengths and angles", "differential coordinates"),
+            (row for name, found in simple.items() for row in simple_rows(name, found)),
+        ),
         plain=pages.table(
             ("", "error of modes", "of components", "ratio"),
             (row for name, found in plain.items() for row in rows(name, found, ("components",))),
@@ -143,6 +214,9 @@ def main() -> None:
         if not file.exists():
             found = measure(name, given.data, given.out)
             pages.write_figures(file, found)
+        found = pages.read_figures(file)
+        if not found.keys() >= set(SIMPLE) and not name.endswith(MIRRORED):
+            pages.write_figures(file, found | measure_simple(name, given.data, given.out, found["counts"]))
         write_page()
 
 

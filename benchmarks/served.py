@@ -32,9 +32,8 @@ from shapespace.training.space.generalisation import (
     vertex_distances,
 )
 from shapespace.training.stages.export import write_bundle_of
-from shapespace.training.stages.ingest import read_meshes
 from shapespace.training.stages.run import execute
-from shapespace.training.stages.stage import Run
+from shapespace.training.stages.stage import Run, read_meshes
 
 #: Largest number of exponentials to learn from: joint, and of each factor.
 JOINT, OF_FACTORS = 1000, 300

@@ -396,6 +396,7 @@ def _einsum(run: _Run, node: _Node) -> Sequence[Value]:
 #: The operators that programs know, by their ONNX names.
 _KINDS: dict[str, Callable[[_Run, _Node], Sequence[Value]]] = {
     "Add": _binary(lambda a, b: a + b),
+    "Atan": _unary("arctan"),
     "BatchNormalization": _batch_norm,
     "Cast": _cast,
     "Clip": _clip,

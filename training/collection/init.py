@@ -15,6 +15,7 @@ from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import ConfigError
 from shapespace.training.runs.network_settings import CombinerSettings, LatentNetworkSettings
 from shapespace.training.runs.settings import (
+    NEARLY_COARSE,
     CollectionSettings,
     ExponentialSettings,
     MaterialSettings,
@@ -40,6 +41,7 @@ data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; rel
 # first_step = "{exponential.first_step}"    # how a geodesic begins; "paper" needs far more time steps to be as exact
 
 [modes]
+geometry = "auto"    # "vertices" and "nric" are straight lines, fast to find; "exponential" bends; "auto" chooses
 # count = "{mode.count}"    # how many numbers describe a shape, at most {most}; "auto" stops when more help little
 # norm = "{mode.norm}"    # how errors of modes are measured; "shell", as in the paper, gives larger vertex errors
 
@@ -87,7 +89,7 @@ def configuration(
     target = CollectionSettings().coarse_vertices
     coarse = (
         f"coarse_vertices = {target}    # vertices to compute with; more take longer, 0 takes all {vertices}"
-        if vertices > target
+        if vertices > NEARLY_COARSE * target
         else f"# coarse_vertices = {target}    # meshes with more vertices are simplified to this number"
     )
     return TEMPLATE.format(

@@ -1,5 +1,6 @@
 """The composite network ``Φ = Ψ ∘ (ψ_1, …, ψ_J)`` (paper, section 3), and the affine sum that it corrects."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
-from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork
+from shapespace.training.learning.networks import ShapeNetwork
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class Composite:
     """Factor networks ψ_j and the combiner Ψ, which maps their outputs to the joint shape."""
 
     factors: list[list[int]]  # latent indices of each factor
-    networks: list[FactorNetwork]  # the factor networks ψ_j
+    networks: Sequence[ShapeNetwork]  # the factor networks ψ_j
     combiner: CombinerNetwork  # Ψ
 
     @property
@@ -32,7 +33,7 @@ class Composite:
         return factor_shapes(self.networks, self.factors, latents)
 
 
-def factor_shapes(networks: list[FactorNetwork], factors: list[list[int]], latents: Tensor) -> Tensor:
+def factor_shapes(networks: Sequence[ShapeNetwork], factors: list[list[int]], latents: Tensor) -> Tensor:
     """Return NRIC (n, J, 2E) of each factor's network for its part of codes (n, m)."""
     return torch.stack([network(latents[:, index]) for network, index in zip(networks, factors, strict=True)], dim=1)
 

@@ -111,6 +111,8 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
     settings, reference = config.evaluation, collection.reference
     z_reference = nric(reference.vertices, reference.connectivity)
     test, composite = HeldOutSamples.of(learner), learner.main()
+    if learner.straight:
+        return _evaluate_straight(learner, test, composite)
     models: dict[str, Composite | nn.Module] = {
         "composite": composite,
         "monolithic": learner.monolithic(),
@@ -158,6 +160,31 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
     }
     gallery = extremes(vertices, test.vertices[first], errors, test.rows[first])
     return figures, gallery | strip(collection, composite, eta) | {"faces": reference.faces}
+
+
+def _evaluate_straight(
+    learner: Learner, test: HeldOutSamples, composite: Composite
+) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Compare a straight-line model with the exact shapes of the test codes. Nothing else is trained beside it, and its
+    one factor is its own affine sum.
+    """
+    config, collection = learner.config, learner.collection
+    first, eta = slice(config.evaluation.reconstructions), config.export.eta_reconstruction
+    predicted = test.predicted(composite)
+    r2 = test.r2_of(predicted)
+    vertices, errors, vertex_error = reconstruct(collection.reference, eta, predicted[first], test.vertices[first])
+    figures = {
+        "eta": config.evaluation.eta,
+        "test_samples": len(test.rows),
+        "r2": {"composite": r2, "affine": r2},
+        "fresh": None,
+        "correction": {"kind": composite.combiner.settings.kind, "tried": {}},
+        "vertex_error": vertex_error,
+        "sizes": {"composite": size_bytes(composite)},
+        "times": model_times(collection, composite, eta),
+    }
+    gallery = extremes(vertices, test.vertices[first], errors, test.rows[first])
+    return figures, gallery | strip(collection, composite, eta) | {"faces": collection.reference.faces}
 
 
 #: Share of the fresh codes whose exponentials are also computed near the limit of many steps.

@@ -7,8 +7,6 @@ Fong 2000), applied to lengths and angles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -19,22 +17,7 @@ from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import in_bytes
 from shapespace.training.learning.linear import principal_axes
 from shapespace.training.learning.networks import predict
-
-
-@dataclass(frozen=True)
-class ExampleGaussians:
-    """Settings of the Gaussians around examples."""
-
-    examples: int = 512  # largest number of examples; the examples with the largest errors are kept
-    coordinates: int = 64  # largest number of coordinates that distinguish shapes
-    # Standard deviation of a Gaussian, as a share of the distance to the nearest other example, where it has fallen to
-    # 0.4 %. Larger Gaussians change random codes more (benchmarks/NOTES.md, Examples).
-    width: float = 0.3
-    same: float = 1e-3  # examples nearer to each other than this share of the largest distance count as one
-    distinct: float = 0.3  # smallest singular value of the Gaussians' matrix that is used; a single example has 1
-
-
-GAUSSIANS = ExampleGaussians()
+from shapespace.training.space.memory import GAUSSIANS
 
 
 class ExampleCorrectedCombiner(CombinerNetwork):

@@ -29,6 +29,7 @@ from shapespace.training.learning.decoder_graph import decoder_graph, exported
 from shapespace.training.learning.layers import narrowest
 from shapespace.training.learning.naming import NamingError, bundle_names
 from shapespace.training.learning.networks import StartNetwork, predict
+from shapespace.training.learning.straight import LinearNetwork
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.sampling import Collection
 
@@ -71,7 +72,7 @@ def difference(composite: Composite, networks: Networks, latents: Tensor, norm: 
     return float(np.sqrt(norm.square(answer - expected) / norm.square(expected)).max())
 
 
-def _networks(composite: Composite, start: StartNetwork | None, latents: Tensor) -> Networks:
+def _networks(composite: Composite, start: StartNetwork | LinearNetwork | None, latents: Tensor) -> Networks:
     some = latents[:2]
     return Networks(
         factors=[
@@ -91,7 +92,7 @@ def export(
     data_digest: str,
     models: Path,
     geometry: Geometry,
-    start: StartNetwork | None = None,
+    start: StartNetwork | LinearNetwork | None = None,
 ) -> Path:
     """Write ``models/NAME/VERSION/``, replacing a bundle that is there.
 

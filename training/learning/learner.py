@@ -25,6 +25,7 @@ from shapespace.training.learning.composite import Composite, factor_shapes
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork, StartNetwork, predict
+from shapespace.training.learning.straight import LinearNetwork, straight_composite, straight_start
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.network_settings import (
@@ -35,6 +36,7 @@ from shapespace.training.runs.network_settings import (
     Recipe,
 )
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
+from shapespace.training.space.straight_collection import StraightCollection
 
 #: Settings of the paper's factor networks.
 PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
@@ -183,6 +185,11 @@ class Learner:
         train = ~(held_out["validation"] | held_out["test"])
         return {"train": np.flatnonzero(train), "validation": np.flatnonzero(held_out["validation"])}
 
+    @property
+    def straight(self) -> bool:
+        """Whether the model is made of straight lines, without training."""
+        return isinstance(self.collection, StraightCollection)
+
     def exponentials(self) -> int:
         """Return the number of joint and factor samples behind the composite, including held-out samples."""
         own = (self.factor_rows(self.factor_samples(j).index) for j in range(len(self.collection.factors)))
@@ -286,7 +293,9 @@ class Learner:
         return TrainingData(inputs, z, rows)
 
     def main(self) -> Composite:
-        """Return the composite of the main recipe, which is exported."""
+        """Return the composite that is exported: of the main recipe, or of a straight-line model."""
+        if isinstance(self.collection, StraightCollection):
+            return straight_composite(self.collection)
         return self.composite(self.config.networks)
 
     def paper(self) -> Composite:
@@ -320,8 +329,10 @@ class Learner:
         slopes = (latents[at], torch.from_numpy(derivatives)) if len(at) else None
         return LatentKernel(self.collection.coordinates, self._scaling(own[1].numpy()), own, held_out, slopes)
 
-    def start(self) -> StartNetwork:
+    def start(self) -> StartNetwork | LinearNetwork:
         """Return the start network, fitted to the joint samples in closed form. It is not saved."""
+        if isinstance(self.collection, StraightCollection):
+            return straight_start(self.collection)
         collection, samples, rows = self.collection, self.joint, self.rows
         network = StartNetwork(collection.coordinates, collection.reference.vertices)
         latents = torch.as_tensor(samples.latents, dtype=torch.float32)

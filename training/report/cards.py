@@ -26,6 +26,14 @@ from shapespace.training.runs.atomic_files import NpzFile
 
 #: Pixels of a picture's longer side. Pages show pictures at half that size or less, so that phones show them sharply.
 LARGE, SMALL = 480, 300
+#: Simple models beside ours, by their names in generalisation.json.
+SIMPLE = {
+    "modes": "model",
+    "components": "PCA",
+    "mirrored_components": "PCA with mirror images",
+    "remembering_components": "PCA with memory of the training shapes",
+    "linear_nric": "straight lines of lengths and angles",
+}
 #: Largest number of modes with pictures.
 MODES_SHOWN = 40
 
@@ -131,6 +139,9 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
             ]
             + _converged(facts),
+            "simple": [
+                (title, [each["mean"] for each in facts[name]]) for name, title in SIMPLE.items() if name in facts
+            ],
             "worst": facts["worst"],
             "pictures": _pair(record.run.least_general, facts["worst"], studio),
         })  # fmt: skip
@@ -138,11 +149,12 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
         modes = facts.get("modes")
         cards.append({
             "title": "Training shapes",
-            "how": f"all {facts['shapes']} shapes, encoded as the server does it"
+            "how": f"all {facts['shapes']} shapes, encoded as the server does it, on the "
+            f"{facts.get('mesh', 'coarse')} mesh"
             + (". The bundle stores corrections at these shapes" if facts.get("remembered") else ""),
             "figures": [
                 ("as served", facts, facts["components"]),
-                *([("modes alone, no networks", modes, facts["components"])] if modes else []),
+                *([("modes alone, no networks, coarse mesh", modes, facts["components"])] if modes else []),
             ],
             "worst": facts["worst"],
             "pictures": _pair(record.run.least_near, facts["worst"], studio),

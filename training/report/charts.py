@@ -86,8 +86,9 @@ def mode_charts(record: Record) -> Iterator[tuple[str, Markup]]:
             Line(np.arange(len(y)), y, hue, kind, ".")
             for kind, y, hue in (
                 ("SPGA", record.modes["localisation"], HUES[0]),
-                ("PGA", record.modes["pga_localisation"], HUES[1]),
+                ("PGA", record.modes.get("pga_localisation"), HUES[1]),
             )
+            if y is not None
         ]
         yield "Localisation", lines("Localisation by mode, SPGA and PGA", "mode", rows)
 

@@ -48,6 +48,7 @@ PLACED |= {
 CORRECTIONS = {
     "kernel": "kernel ridge regression",
     "products": "products of two factors' coefficients",
+    "sum": "their sum alone",
     "convolutions": "graph convolutions",
     "field": "a perceptron at every edge",
 }
@@ -82,6 +83,7 @@ def page(record: Record) -> str:
         record=record,
         accuracy=accuracy_cards(record, close or None),
         qualities=_qualities(record),
+        geometry=_geometry(record.geometry),
         stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shape_pictures(record, close)) if close else [],
@@ -120,6 +122,32 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
         for name, digits, title in rows
         if name in found
     ]
+
+
+#: The maps from codes to shapes, in words.
+GEOMETRIES = {
+    "vertices": "straight lines of vertices",
+    "nric": "straight lines of lengths and angles",
+    "exponential": "exponentials",
+}
+
+
+def _geometry(choice: dict[str, Any]) -> str:
+    """Return sentences on the map from codes to shapes, and what it gains; empty where nothing was chosen."""
+    if not choice:
+        return ""
+    kind, errors = choice["kind"], choice["errors"]
+    sentence = f"Codes make shapes by {GEOMETRIES[kind]}"
+    if not errors:
+        return f"{sentence}."
+    others = [f"{percent(error)} by {GEOMETRIES[each]}" for each, error in errors.items() if each != kind]
+    found = (
+        f"{sentence}. The run chose this map on {choice['held_out']} shapes that were held out in turn, with "
+        f"{choice['compared']} coordinates. The error was {percent(errors.get(kind))}"
+    )
+    if not others:
+        return f"{found}. The other maps had no mean shape."
+    return f"{found}, beside {' and '.join(others)}. A cheaper map is chosen if its error is at most 2 % larger."
 
 
 def _correction(correction: dict[str, Any]) -> str:

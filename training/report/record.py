@@ -76,6 +76,7 @@ class Record:
             _read, (run.decomposition, run.evaluation, run.histories)
         )
         self.generalisation, self.encoded, grouping = map(_read, (run.generalisation, run.encoded, run.factors))
+        self.geometry = _read(run.geometry)
         self.mean: FloatArray | None = mean.get("vertices")
         #: (V, 3) base point of tangent vectors: the mean, or the reference if there is no mean.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean

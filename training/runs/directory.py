@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -105,6 +105,27 @@ class RunDirectory:
                 if isinstance(event, dict):
                     yield event
 
+    def spent(self, stage: str, key: str) -> float:
+        """Return the seconds that earlier calls worked on a stage with this key without ending it.
+
+        A call that was killed counts up to its last line in the log.
+        """
+        total, begun, last = 0.0, None, None
+        for event in self.events():
+            try:
+                now = datetime.fromisoformat(event["time"])
+            except (KeyError, TypeError, ValueError):
+                continue
+            if event.get("event") in ("begin", "end"):
+                if begun and last and event["event"] == "begin":
+                    total += (last - begun).total_seconds()
+                of_it = event.get("stage") == stage
+                begun = now if event["event"] == "begin" and of_it and event.get("key") == key else None
+                if event["event"] == "end" and of_it:
+                    total = 0.0
+            last = now
+        return total + ((last - begun).total_seconds() if begun and last else 0.0)
+
     def at_work(self) -> str:
         """Return the progress of the running stage, from the last line of the log; empty if it reports none."""
         last = deque(self.events(), maxlen=1)
@@ -136,6 +157,8 @@ class RunDirectory:
 
     mean = RunFile(NpzFile, "mean.npz")
     """``vertices (V, 3)`` of the centred mean, its ``status``, ``iterations`` and ``residual``; ``steps``, K."""
+    geometry = RunFile(JsonFile, "geometry.json")
+    """The map from codes to shapes, ``kind``, and what it was chosen by: see space.geometry.GeometryChoice."""
     modes_by_strength = RunFile(NpzFile, "modes-by-strength.npz")
     """The sparse modes, strongest first: ``nric``, ``vertices``, ``coefficients``, ``lower``, ``upper`` and
     ``localisation``; ``pga_nric``, ``pga_vertices`` and ``pga_localisation`` are for the principal modes."""
@@ -220,6 +243,11 @@ class RunDirectory:
     def log_steps(self) -> int:
         """Read the time steps K of the logarithms, which were chosen with the mean."""
         return int(self.mean.read()["steps"])
+
+    def straight_kind(self) -> Literal["vertices", "nric"] | None:
+        """Read the kind of straight lines from codes to shapes; None for exponentials."""
+        kind = self.geometry.read_if_written().get("kind", "exponential")
+        return None if kind == "exponential" else kind
 
     def steps(self) -> int:
         """Read the time steps K of exponentials: chosen with the modes, or by version 0.2 with the mean."""

@@ -93,6 +93,12 @@ class ProductSettings(SettingsTable):
     """Principal coefficients of each factor."""
 
 
+class SumSettings(SettingsTable):
+    """No correction: the affine sum of the factors. Straight-line models have it, because it is exact there."""
+
+    kind: Literal["sum"] = "sum"
+
+
 class ConvolutionSettings(SettingsTable):
     """Graph convolutions on the edges, trained by gradient descent."""
 
@@ -191,7 +197,7 @@ class AutoSettings(SettingsTable):
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
 ResolvedCorrection = Annotated[
-    KernelSettings | ProductSettings | ConvolutionSettings | FieldSettings, Field(discriminator="kind")
+    KernelSettings | ProductSettings | SumSettings | ConvolutionSettings | FieldSettings, Field(discriminator="kind")
 ]
 CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
 

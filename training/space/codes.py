@@ -1,7 +1,11 @@
 """Codes of the shapes of a collection: their exponentials come closest to the shapes, in vertices."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +15,7 @@ from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.mesh.rigid_motion import align, aligned_change
 from shapespace.shell.exponential import exponential
 from shapespace.shell.exponential_derivative import ExponentialDerivative
-from shapespace.shell.space import DiscretePath, ShellSpace
+from shapespace.shell.space import ShellSpace
 from shapespace.solve.least_squares import Box, Stopping, least_squares
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import progress
@@ -61,12 +65,14 @@ def nearest_codes(
     Modes (m, V, 3) are vertex fields at the mean (V, 3), scaled so that codes are about 1. Shapes (n, V, 3) may be in
     any position; ``start`` (n, m) has codes nearby. The result does not depend on the number of workers.
     """
-    everywhere = np.full(len(modes), np.inf)
-    box = Box(-everywhere, everywhere, np.ones(len(modes)))
     items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
-    results = run(partial(_nearest, space, mean, modes, box, steps), items, workers=workers)
-    found = dict(progress(results, "codes", "shape", len(items)))
-    codes, vertices, counts, status = zip(*(found[k] for k in range(len(items))), strict=True)
+    return gathered(run(partial(_nearest, space, mean, modes, steps), items, workers=workers), len(items))
+
+
+def gathered(results: Iterable[tuple[int, NearestCode]], count: int) -> Codes:
+    """Return the codes of ``count`` searches that end in any order."""
+    found = dict(progress(results, "codes", "shape", count))
+    codes, vertices, counts, status = zip(*(found[k] for k in range(count)), strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
 
 
@@ -103,27 +109,59 @@ def _by_steps(space: ShellSpace, mean: FloatArray, modes: FloatArray, code: Floa
     return np.stack([path.nric[-1] for path in paths]) if all(path.converged for path in paths) else None
 
 
-def _nearest(
-    space: ShellSpace, mean: FloatArray, modes: FloatArray, box: Box, steps: int, item: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, int, Status]:
-    target, start = item
+class NearestCode(NamedTuple):
+    """The code whose shape comes closest to a shape."""
+
+    code: FloatArray  # (m,)
+    vertices: FloatArray  # (V, 3) its shape, aligned to the given one
+    shapes: int  # number of shapes of the search
+    status: Status
+
+
+#: Map from a code (m,) to its shape (V, 3) and the function that computes its derivative (m, V, 3); None where the code
+#: has no shape.
+ShapeMap = Callable[[FloatArray], tuple[FloatArray, Callable[[], FloatArray]] | None]
+
+
+def nearest_code(shape_of: ShapeMap, target: FloatArray, start: FloatArray) -> NearestCode:
+    """Find the code that minimises ``‖shape_of(w) − x‖²`` over vertices, after rigid alignment, by Gauss–Newton.
+
+    The target x is (V, 3), the start (m,). The code 0 must have a shape.
+    """
+    everywhere = np.full(len(start), np.inf)
+    box = Box(-everywhere, everywhere, np.ones(len(start)))
 
     @lru_cache(2)  # for the best code and for the code that is tried
-    def shoot(code: tuple[float, ...]) -> DiscretePath:
-        return exponential(space, mean, np.tensordot(np.array(code), modes, axes=1), steps)
+    def shoot(code: tuple[float, ...]) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
+        return shape_of(np.array(code))
 
     def residuals(x: FloatArray) -> FloatArray:
-        path = shoot(tuple(x))
-        if not path.converged:
-            return np.full(target.size, np.nan)
-        return (align(path.vertices[-1], target) - target).ravel()
+        found = shoot(tuple(x))
+        return np.full(target.size, np.nan) if found is None else (align(found[0], target) - target).ravel()
+
+    def shape_at(x: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
+        found = shoot(tuple(x))
+        if found is None:
+            raise RuntimeError("the search went to a code without a shape")
+        return found
 
     def jacobian(x: FloatArray, _: FloatArray) -> FloatArray:
-        path = shoot(tuple(x))
-        changes = aligned_change(path.vertices[-1], ExponentialDerivative(path).push_forward(modes), target)
+        vertices, derivative = shape_at(x)
+        changes = aligned_change(vertices, derivative(), target)
         return changes.reshape(len(changes), -1).T
 
-    # The exponential of 0, the mean, always converges.
-    first = next(share * start for share in START_SHARES if shoot(tuple(share * start)).converged)
+    first = next(share * start for share in START_SHARES if shoot(tuple(share * start)))
     fit = least_squares(residuals, jacobian, first, box, STOPPING)
-    return fit.x, align(shoot(tuple(fit.x)).vertices[-1], target), fit.iterations, fit.status
+    return NearestCode(fit.x, align(shape_at(fit.x)[0], target), fit.iterations, fit.status)
+
+
+def _nearest(
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, item: tuple[FloatArray, FloatArray]
+) -> NearestCode:
+    def exponentials(code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
+        path = exponential(space, mean, np.tensordot(code, modes, axes=1), steps)
+        if not path.converged:
+            return None
+        return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)
+
+    return nearest_code(exponentials, *item)

@@ -6,11 +6,9 @@ alignment, as shares of the diagonal of the reference's bounding box.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import dihedral_angles
@@ -25,8 +23,7 @@ from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
-from shapespace.training.space.modes import ModeError, coefficients, mode_count, pga
-from shapespace.training.space.sparse_modes import find_modes
+from shapespace.training.space.modes import ModeError, coefficients, pga
 
 #: Number of folds. Below twice this number of shapes, each shape is held out by itself.
 FOLDS = 5
@@ -102,40 +99,6 @@ def folds(count: int) -> list[IntArray]:
     return [np.arange(fold, count, parts) for fold in range(parts)]
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Held-out shapes, approximated in the space that was found without them."""
-
-    index: IntArray  # (k,) indices of the shapes in the collection
-    counts: Sequence[float]  # numbers of modes
-    # (k, V, 3) for each number: ``modes`` has the nearest exponentials, ``components`` the projections onto as many
-    # principal components, and ``mirrored_components`` those of the shapes and their mirror images, where there are any
-    near: dict[str, list[FloatArray]]
-    steps: IntArray  # (k,) K of the exponentials
-    # (k,) for each number: whether the search did not converge, because faces of exponentials collapse
-    stuck: list[NDArray[np.bool_]]
-
-    def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
-        """Return distances to the shapes (n, V, 3) of the collection: (k, V) for each kind and number of modes."""
-        given = shapes[self.index]
-        return {kind: [vertex_distances(each, given, diagonal) for each in found] for kind, found in self.near.items()}
-
-
-def joined(parts: Sequence[HeldOut]) -> HeldOut:
-    """Join the shapes of several folds. The numbers of modes are means."""
-
-    def together(by_count: Iterable[list[NDArray]]) -> list[NDArray]:
-        return [np.concatenate(each) for each in zip(*by_count, strict=True)]
-
-    return HeldOut(
-        index=np.concatenate([part.index for part in parts]),
-        counts=np.mean([part.counts for part in parts], axis=0).tolist(),
-        near={kind: together(part.near[kind] for part in parts) for kind in parts[0].near},
-        steps=np.concatenate([part.steps for part in parts]),
-        stuck=together(part.stuck for part in parts),
-    )
-
-
 def time_steps(
     settings: ModeSettings,
     reference: TriangleMesh,
@@ -178,7 +141,7 @@ def time_steps(
 
 def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material, first_step: FirstStep) -> float:
     """Return the share of random shapes of one step that fold where none of the shapes (n, V, 3) has a crease."""
-    space, mean, fields = _space(reference, shapes, material, 1, first_step)
+    space, mean, fields = space_of(reference, shapes, material, 1, first_step)
     modes = pga(space, mean, fields, min(FOLDED_MODES, len(shapes) - 1), "vertices").vertices
     lower, upper = box_of(coefficients(space, mean, fields, modes, "vertices")[0])
     codes = np.random.default_rng(0).uniform(lower, upper, (FOLDED_SHAPES, len(modes)))
@@ -187,7 +150,7 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material, fir
     return float(folded_anew(angles, others).mean())
 
 
-def _space(
+def space_of(
     reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int, first_step: FirstStep
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
     """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3). Raises ModeError
@@ -210,7 +173,7 @@ def _missed(
     first_step: FirstStep,
 ) -> float:
     """Return the mean distance between the originals among shapes (n, V, 3) and the modes of the other folds."""
-    space, mean, fields = _space(reference, shapes, material, steps, first_step)
+    space, mean, fields = space_of(reference, shapes, material, steps, first_step)
     count = int(original_index.max()) + 1
     away = []
     for index in folds(count):
@@ -219,54 +182,3 @@ def _missed(
         near = nearest_codes(space, mean, directions, shapes[index], start, steps).vertices
         away.append(vertex_distances(near, shapes[index], 1.0))
     return float(np.concatenate(away).mean())
-
-
-def held_out(
-    reference: TriangleMesh,
-    shapes: FloatArray,
-    index: IntArray,
-    counts: Sequence[int] | None,
-    settings: ModeSettings,
-    material: Material,
-    steps: int | None = None,
-    original: IntArray | None = None,
-    first_step: FirstStep = "centred",
-) -> HeldOut:
-    """Find mean, logarithms and modes without some shapes, and approximate these shapes.
-
-    Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
-    shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
-    number of the other shapes. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`. Raises
-    ModeError if the other shapes have no mean, or no modes.
-    """
-    original = np.arange(len(shapes)) if original is None else original
-    known = np.flatnonzero(~np.isin(original, index))
-    kept, unseen = shapes[known], shapes[index]
-    original_index = np.unique(original[known], return_inverse=True)[1]
-    if steps is None:
-        steps = min(LIGHT_STEPS, time_steps(settings, reference, kept, material, original_index, first_step))
-    space, mean, fields = _space(reference, kept, material, steps, first_step)
-    own = original[known] == known
-    components = PrincipalComponents.of(kept[own], reference.vertices)
-    mirrored = None if own.all() else PrincipalComponents.of(kept, reference.vertices)
-    if counts is None:
-        count = mode_count(settings, space, mean, fields, original_index)
-        counts = [-(-count // 2), count]
-    counts = [min(count, len(kept) - 1) for count in counts]
-    # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far shape.
-    towards = logarithms(space, mean, unseen, steps).fields
-    reached, stuck = [], []
-    near: dict[str, list[FloatArray]] = {"modes": [], "components": []}
-    if mirrored:
-        near["mirrored_components"] = []
-    for count in counts:
-        modes = find_modes(settings, space, mean, fields, count, original_index)
-        start, _ = coefficients(space, mean, towards, modes.vertices, settings.norm)
-        found = nearest_codes(space, mean, modes.vertices, unseen, start, steps)
-        near["modes"].append(found.vertices)
-        stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
-        near["components"].append(components.nearest(unseen, len(modes)))
-        if mirrored:
-            near["mirrored_components"].append(mirrored.nearest(unseen, len(modes)))
-        reached.append(len(modes))
-    return HeldOut(index, reached, near, np.full(len(index), steps), stuck)

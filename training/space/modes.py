@@ -90,8 +90,9 @@ def mode_count(
 ) -> int:
     """Return the number of modes, as configured or by cross-validation, and less than n.
 
-    The choice m minimises ``error(m) + WORTH · m``. The error is the distance between held-out logarithms and the span
-    of m principal modes of the other shapes, as a share of the logarithms' length. No exponentials are computed.
+    The choice m minimises ``error(m) + WORTH · m`` and is at most `most_modes`. The error is the distance between
+    held-out logarithms and the span of m principal modes of the other shapes, as a share of the logarithms' length. No
+    exponentials are computed.
 
     Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. ``original_index`` (n,)
     is the index of each shape's original, from 0: a shape and its mirror image are held out together. Raises ModeError
@@ -100,9 +101,41 @@ def mode_count(
     if settings.count != "auto":
         return max(1, min(settings.count, len(fields) - 1))
     problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
-    left = np.sqrt(problem.left_of_held_out(original_index))
-    errors = left.mean(axis=0) / left[:, 0].mean()
-    return max(1, int(np.argmin(errors + WORTH * np.arange(len(fields)))))
+    return worthwhile(problem.left_of_held_out(original_index), original_index)
+
+
+def worthwhile(left: FloatArray, original_index: IntArray | None = None) -> int:
+    """Return the number of modes that pay, see `mode_count`, from square errors (n, n) of held-out shapes."""
+    errors = np.sqrt(left)[:, : 1 + most_modes(len(left), original_index)].mean(axis=0)
+    return max(1, int(np.argmin(errors / errors[0] + WORTH * np.arange(len(errors)))))
+
+
+def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -> FloatArray:
+    """Return square errors (n, n) of held-out vectors for 0, 1, 2 … principal modes of the other vectors.
+
+    ``gram`` (n, n) has the inner products of the vectors.
+    """
+    n = len(gram)
+    original_index = np.arange(n) if original_index is None else original_index
+    parts = min(INNER_FOLDS, int(original_index.max()) + 1)
+    left = np.zeros((n, n))
+    for held in (np.flatnonzero(original_index % parts == part) for part in range(parts)):
+        kept = np.delete(np.arange(n), held)
+        values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
+        some = np.flatnonzero(values > NEGLIGIBLE * gram.trace())[::-1]
+        along = np.zeros((len(held), n))
+        along[:, 1 : 1 + len(some)] = (gram[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
+        left[held] = np.maximum(gram[held, held][:, None] - np.cumsum(along, axis=1), 0)
+    return left
+
+
+def most_modes(count: int, original_index: IntArray | None = None) -> int:
+    """Return the largest number of modes that inner folds of ``count`` shapes support: one less than the originals of
+    a fold. A mirror image adds no shape, so it supports no further mode.
+    """
+    originals = count if original_index is None else int(original_index.max()) + 1
+    parts = min(INNER_FOLDS, originals)
+    return max(1, originals - -(-originals // parts) - 1)
 
 
 def validation_norm(norm: Norm) -> Norm:
@@ -195,18 +228,7 @@ class ModeProblem:
 
     def left_of_held_out(self, original_index: IntArray | None = None) -> FloatArray:
         """Return square errors (n, n) of held-out logarithms for 0, 1, 2 … principal modes of the other logarithms."""
-        gram, n = self.D @ self.MD, len(self.D)
-        original_index = np.arange(n) if original_index is None else original_index
-        parts = min(INNER_FOLDS, int(original_index.max()) + 1)
-        left = np.zeros((n, n))
-        for held in (np.flatnonzero(original_index % parts == part) for part in range(parts)):
-            kept = np.delete(np.arange(n), held)
-            values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
-            some = np.flatnonzero(values > NEGLIGIBLE * self.total)[::-1]
-            along = np.zeros((len(held), n))
-            along[:, 1 : 1 + len(some)] = (gram[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
-            left[held] = np.maximum(gram[held, held][:, None] - np.cumsum(along, axis=1), 0)
-        return left
+        return left_of_held_out(self.D @ self.MD, original_index)
 
     def modes(self, D: FloatArray, converged: bool = True, history: list[dict[str, float]] | None = None) -> Modes:
         """Project the logarithms onto the span of fields (m, 3V); drop negligible modes; scale, orient and sort."""

@@ -20,6 +20,15 @@ from shapespace.training.runs.sampling import SampledShapes
 from shapespace.training.space.codes import LIMIT_STEPS
 
 
+def names_of(factors: dict[str, list[int]]) -> tuple[str, ...]:
+    """Name latents after their factors: "upper left", or "upper left, 1" and so on where a factor has several."""
+    names = {}
+    for factor, members in factors.items():
+        for k, j in enumerate(members, 1):
+            names[j] = factor if len(members) == 1 else f"{factor}, {k}"
+    return tuple(names[j] for j in sorted(names))
+
+
 @dataclass(frozen=True, eq=False)
 class ShellCollection:
     """The shapes ``exp_z̄(Σ_j w_j u_j)`` of codes w in a hypercube (paper, section 3); see sampling.Collection.
@@ -54,12 +63,8 @@ class ShellCollection:
 
     @property
     def latent_names(self) -> tuple[str, ...]:
-        """(m,) names after the factors: "upper left", or "upper left, 1" and so on where a factor has several modes."""
-        names = [""] * len(self.modes)
-        for factor, members in self.factors.items():
-            for k, j in enumerate(members, 1):
-                names[j] = factor if len(members) == 1 else f"{factor}, {k}"
-        return tuple(names)
+        """(m,) names after the factors."""
+        return names_of(self.factors)
 
     @property
     def coordinates(self) -> Coordinates:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import shapespace
+from shapespace.arrays import FloatArray
 from shapespace.bundle.attributes import from_entry
 from shapespace.bundle.geometry import FineMesh, Geometry
 from shapespace.bundle.schema import AttributesEntry
@@ -15,12 +16,16 @@ from shapespace.coordinates.nric import nric
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.collection.mesh_collection import normalised
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
 from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.space.generalisation import PrincipalComponents, summary, vertex_distances
 from shapespace.training.stages.networks import learner_of
-from shapespace.training.stages.stage import Run, Stage, StageWarning, listed
+from shapespace.training.stages.stage import Run, Stage, StageWarning, listed, read_meshes
+
+#: Most bytes of fine shapes that are compared with the shapes of their codes.
+LARGEST_FINE = 2**29
 
 
 def export_bundle(run: Run) -> None:
@@ -65,7 +70,8 @@ def _geometry(run: RunDirectory) -> Geometry:
     return Geometry(
         reference=mean,
         fine=fine,
-        modes=modes["vertices"],
+        # Lengths and angles are no tangent vectors.
+        modes=None if run.straight_kind() == "nric" else modes["vertices"],
         training_codes=run.training_codes(),
         file_vertices=reference.get("file_vertices"),
         surface=_surface(run),
@@ -82,18 +88,25 @@ def _surface(run: RunDirectory) -> MeshAttributes | None:
 def _encode_collection(run: Run, bundle: Path) -> None:
     """Write ``encoded.json``: the distance between the collection's shapes and the shapes of their codes.
 
-    Codes are found by ``encode`` as it is served. For comparison there are the distances of exponentials, without
-    networks and without stored training shapes. ``least-near.npz`` has the shape with the largest distance.
+    Codes are found by ``encode`` as it is served, from the fine mesh as users send it. For comparison there are the
+    distances of exponentials on the coarse mesh, without networks and without stored training shapes.
+    ``least-near.npz`` has the shape with the largest distance, on the coarse mesh.
     """
     directory = run.directory
-    model, reference, names = shapespace.load(bundle), directory.reference_mesh(), directory.shapes.read()["names"]
-    given, scale = directory.own_shapes(), float(directory.reference.read()["scale"])
+    model, names = shapespace.load(bundle), directory.shapes.read()["names"]
+    reference = directory.reference.read()
+    scale, given, mesh = float(reference["scale"]), directory.own_shapes(), directory.reference_mesh()
+    fine, index = _fine_shapes(run), np.arange(len(mesh.vertices))
+    if fine is not None:
+        mesh = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
+        given, index = fine, reference["fine_index"]
     found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
     near = np.stack([each.shape.vertices for each in found]) / scale
-    linear = PrincipalComponents.of(given, reference.vertices).nearest(given, model.latents.dimension)
-    away, other = (vertex_distances(each, given, reference.diagonal) for each in (near, linear))
+    linear = PrincipalComponents.of(given, mesh.vertices).nearest(given, model.latents.dimension)
+    away, other = (vertex_distances(each, given, mesh.diagonal) for each in (near, linear))
     worst = int(away.mean(axis=1).argmax())
     facts = summary(away) | {
+        "mesh": "coarse" if fine is None and "fine_faces" in reference else "fine",
         "components": summary(other),
         "modes": directory.decomposition.read().get("left"),
         "remembered": run.config.export.examples,
@@ -101,9 +114,24 @@ def _encode_collection(run: Run, bundle: Path) -> None:
         "outside": [str(name) for name, each in zip(names, found, strict=False) if not each.inside_bounds],
         "worst": str(names[worst]),
     }
-    directory.least_near.write(given=given[worst], found=near[worst])
+    directory.least_near.write(given=given[worst][index], found=near[worst][index])
     directory.encoded.write({MADE_BY: made_by()} | facts)
     directory.log("encoded", **facts)
+
+
+def _fine_shapes(run: Run) -> FloatArray | None:
+    """Read the fine shapes (n, Vf, 3) of the collection again, since a run keeps coarse ones only.
+
+    None if the meshes have no finer vertices, if their files are gone, or if the shapes are too large to be compared.
+    """
+    directory, source = run.directory, run.config.collection.data
+    if not directory.prolongation.exists() or (source and not source.exists()):
+        return None
+    fine = directory.reference.read()["fine_vertices"]
+    if len(directory.own_shapes()) * fine.nbytes > LARGEST_FINE:
+        return None
+    meshes = read_meshes(run.config)
+    return normalised(meshes, meshes.index(run.config.collection.reference))[0]
 
 
 def _warnings(run: RunDirectory) -> list[StageWarning]:

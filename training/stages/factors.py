@@ -8,10 +8,13 @@ from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.space.factors import between, group, names, overlap
 from shapespace.training.stages.stage import Run, Stage
 
+#: Name of the factor of a straight-line model.
+WHOLE = "whole shape"
+
 
 def find_factors(run: Run) -> None:
     """Write ``factors.json``; of meshes also ``modes.npz``, where each factor's latents are a range, as in bundles.
-    Raises FactorError if there are fewer modes than factors were asked for.
+    Dense modes of straight lines are one factor. Raises FactorError if there are fewer modes than factors.
     """
     directory = run.directory
     if run.by_design:
@@ -22,7 +25,8 @@ def find_factors(run: Run) -> None:
     norm = WeightedNorm.of(centre, run.config.material.eta)
     z = np.ascontiguousarray(found["nric"])  # sums round by the order in memory, and files keep that
     shared = overlap(z, norm)
-    groups = group(shared, run.config.factors.count)
+    straight = directory.straight_kind() is not None
+    groups = [list(range(len(z)))] if straight else group(shared, run.config.factors.count)
     order = [j for members in groups for j in members]
     ordered = {name: found[name][order] for name in ("nric", "vertices", "lower", "upper", "localisation")}
     ordered |= {name: found[name][:, order] for name in ("coefficients", "mirrored_coefficients")}
@@ -32,7 +36,7 @@ def find_factors(run: Run) -> None:
     directory.factors.write(
         {
             "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
-            "names": names(groups, z, norm, centre),
+            "names": [WHOLE] if straight else names(groups, z, norm, centre),
             "overlap": between(shared, groups).tolist(),
         }
     )

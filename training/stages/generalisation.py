@@ -5,7 +5,8 @@ from typing import Any
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.provenance import MADE_BY, made_by
-from shapespace.training.space.generalisation import FOLDS, folds, held_out, joined, summary
+from shapespace.training.space.generalisation import FOLDS, folds, summary
+from shapespace.training.space.held_out import held_out, joined
 from shapespace.training.space.modes import ModeError
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 

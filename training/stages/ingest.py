@@ -13,17 +13,19 @@ from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.prolongation import AttachedPart, Prolongation, submesh
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
-from shapespace.training.collection.generators import MESHES
-from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.large_arrays import some_vertices, stacked
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 from shapespace.training.collection.mirror import find_mirror, mirrored
-from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
-from shapespace.training.runs.settings import CollectionSettings
+from shapespace.training.runs.settings import NEARLY_COARSE, CollectionSettings
 from shapespace.training.space.generalisation import FOLDS
-from shapespace.training.stages.stage import Run, Stage, StageWarning
+from shapespace.training.stages.stage import Run, Stage, StageWarning, read_meshes
+
+#: Smallest angle of a good coarse mesh, in degrees.
+LEAST_ANGLE = 2
+#: What helps against a poor coarse mesh.
+REMEDY = "another collection.coarse_vertices may avoid it, or better triangles there in the files"
 
 
 def ingest(run: Run) -> None:
@@ -84,16 +86,6 @@ def ingest(run: Run) -> None:
     directory.log("ingested", **facts)
 
 
-def read_meshes(config: Config) -> MeshCollection:
-    """Read the collection of a run; raises ConfigError where none is named, IngestError where it can't be used."""
-    settings = config.collection
-    if settings.generator is not None:
-        return MESHES[settings.generator]()
-    if settings.data is None:
-        raise ConfigError("collection.data is missing: set it to the folder of the meshes, or give --data")
-    return read_collection(settings.data, settings.parts, settings.file)
-
-
 def write_reference(run: RunDirectory, mesh: TriangleMesh, scale: float, **fine: np.ndarray) -> None:
     """Write ``reference.npz``, see RunDirectory.reference."""
     run.reference.write(vertices=mesh.vertices, faces=mesh.faces, edges=mesh.edges, scale=np.array(scale), **fine)
@@ -123,7 +115,7 @@ def _coarse_mesh(
     """
     own = np.unique(meshes.shell_faces)
     shell = submesh(fine, own) if meshes.parts else fine
-    if not 0 < settings.coarse_vertices < len(own):
+    if not 0 < NEARLY_COARSE * settings.coarse_vertices < len(own):
         return shell, own, {}
     with waiting("coarse mesh"):
         every = some_vertices(vertices, own)
@@ -196,6 +188,16 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
     sentences = [*facts.get("notes", ()), *facts.get("warnings", ())]
     if facts.get("reason"):
         sentences.append(f"coarse mesh: {facts['reason']}")
+    if facts.get("folds"):
+        sentences.append(
+            f"coarse mesh: {facts['folds']} pairs of neighbouring faces are folded onto one another in some shape. "
+            f"Logarithms and samples may fail there; {REMEDY}"
+        )
+    if facts.get("smallest_angle", np.inf) < LEAST_ANGLE:
+        sentences.append(
+            f"coarse mesh: the smallest angle of a face is {facts['smallest_angle']:.1f}°. Below {LEAST_ANGLE}°, "
+            f"shapes are found slowly and less exactly; {REMEDY}"
+        )
     return [StageWarning(sentence) for sentence in sentences]
 
 

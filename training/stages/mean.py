@@ -1,5 +1,8 @@
 """Stage `mean`: the mean shape, where the tangent space is attached, and the number of time steps K."""
 
+from dataclasses import asdict
+from typing import Any
+
 import numpy as np
 
 from shapespace.mesh.rigid_motion import align
@@ -8,8 +11,11 @@ from shapespace.shell.mean import Mean
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.generalisation import LIGHT_STEPS, time_steps
+from shapespace.training.space.generalisation import LIGHT_STEPS
+from shapespace.training.space.geometry import choose_geometry
 from shapespace.training.space.mean import centred_mean
+from shapespace.training.space.modes import ModeError
+from shapespace.training.space.straight_lines import StraightLines
 from shapespace.training.stages.stage import Run, Stage
 
 
@@ -18,12 +24,32 @@ class MeanError(ValueError):
 
 
 def find_mean(run: Run) -> None:
-    """Write ``mean.npz``: the centred elastic mean of all shapes, and K. Raises MeanError if the mean is not found."""
+    """Write ``mean.npz``: the centred elastic mean of all shapes, and K.
+
+    Unless the configuration asks for exponentials, write ``geometry.json``. On straight lines the mean is their shape
+    of the code 0.
+
+    Raises MeanError if the mean is not found.
+    """
     directory, material = run.directory, run.config.shell_material
     reference, given = directory.reference_mesh(), directory.shapes.read()
     shapes = given["vertices"]
     first_step = run.config.exponential.first_step
-    steps = time_steps(run.config.modes, reference, shapes, material, given["original"], first_step)
+    try:
+        choice = choose_geometry(run.config.modes, reference, shapes, material, given["original"], first_step)
+    except ModeError as error:
+        raise MeanError(
+            f"the shapes have no mean of the kind that modes.geometry asks for: {error}; choose another modes.geometry"
+        ) from None
+    if run.config.modes.geometry != "exponential":
+        directory.geometry.write(asdict(choice))
+        directory.log("chosen", **asdict(choice))
+    steps = choice.steps
+    if choice.kind != "exponential":
+        lines = StraightLines.of(choice.kind, shapes, reference)
+        status = str(Status.CONVERGED)
+        directory.mean.write(vertices=lines.reference.vertices, status=np.array(status), steps=np.array(steps))
+        return
     found = centred_mean(reference, shapes, material, min(LIGHT_STEPS, steps), first_step=first_step)
     if found.status is not Status.CONVERGED:
         raise MeanError(_describe_failure(directory, found))
@@ -55,11 +81,15 @@ def _describe_failure(run: RunDirectory, found: Mean) -> str:
     )
 
 
-def _step_settings(modes: ModeSettings) -> ModeSettings:
-    """Return ``log_steps``, or where K is chosen the number of modes by which it is chosen."""
-    if modes.log_steps == "auto":
-        return ModeSettings(count=modes.count)
-    return ModeSettings(log_steps=modes.log_steps)
+def _choice_settings(modes: ModeSettings) -> dict[str, Any]:
+    """Return ``log_steps``, or where K is chosen the number of modes by which it is chosen.
+
+    Where the map from codes to shapes is chosen too, return all that decides.
+    """
+    decide = {"log_steps"} if modes.log_steps != "auto" else {"count"}
+    if modes.geometry != "exponential":
+        decide = {"geometry", "count", "log_steps", "norm"}
+    return ModeSettings(**modes.model_dump(include=decide)).key
 
 
 STAGE = Stage(
@@ -68,10 +98,10 @@ STAGE = Stage(
     # Without the table for the paper's first step: runs of version 0.2 had none, and are done.
     settings=lambda config: [
         config.material,
-        _step_settings(config.modes),
+        _choice_settings(config.modes),
         *([] if config.exponential.first_step == "paper" else [config.exponential]),
     ],
     run=find_mean,
-    results=lambda run: [run.mean.path],
+    results=lambda run: [run.mean.path, run.geometry.path],
     meshes_only=True,
 )

@@ -13,6 +13,7 @@ from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count, pga
 from shapespace.training.space.sparse_modes import find_modes
+from shapespace.training.space.straight_lines import StraightLines
 from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning, listed
 
 
@@ -21,6 +22,9 @@ def decompose(run: Run) -> None:
     ModeError if the collection has no modes, or none at this sparsity.
     """
     directory, config = run.directory, run.config
+    if directory.straight_kind():
+        _straighten(run)
+        return
     settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()
     shapes, original_index = given["vertices"], given["original"]
     originals = original_index.max() + 1
@@ -71,6 +75,44 @@ def decompose(run: Run) -> None:
     directory.log("found", **facts)
 
 
+def _straighten(run: Run) -> None:
+    """Write the same files for straight lines. Their modes are principal, and need no logarithm."""
+    directory, given, chosen = run.directory, run.directory.shapes.read(), run.directory.geometry.read()
+    shapes, originals, centre = given["vertices"], int(given["original"].max()) + 1, directory.mean_mesh()
+    every = StraightLines.of(chosen["kind"], shapes, directory.reference_mesh())
+    lines = every.first(chosen["count"])
+    found = lines.nearest(shapes)
+    lower, upper = box_of(found.codes)
+    arrays = {
+        "nric": lines.nric,
+        "vertices": lines.fields,
+        "mean": lines.mean,
+        "coefficients": found.codes[:originals],
+        "mirrored_coefficients": found.codes[originals:],
+        "lower": lower,
+        "upper": upper,
+        "localisation": localisation(lines.nric, WeightedNorm.of(centre, run.config.material.eta)),
+    }
+    directory.modes_by_strength.write(**arrays)
+    directory.modes.write(**arrays, rank=np.arange(len(lines)))
+    explained = float(every.explained[: len(lines)].sum())
+    facts: dict[str, Any] = {
+        "modes": len(lines),
+        "converged": True,
+        "explained": explained,
+        "sparsity": 0.0,
+        "pga_explained": explained,
+        "linearised_logarithms": 0,
+        "asked": chosen["count"],
+        "log_steps": 1,
+        "steps": [1] * len(shapes),
+        "codes": [str(status) for status in found.status],
+        "left": summary(vertex_distances(found.vertices, shapes, directory.reference_mesh().diagonal)[:originals]),
+    }
+    directory.decomposition.write(facts | {"history": []})
+    directory.log("found", **facts)
+
+
 def _warnings(run: RunDirectory) -> list[StageWarning]:
     facts = run.decomposition.read_if_written()
     if "steps" not in facts:
@@ -112,7 +154,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="modes",
     version=2,
-    settings=lambda config: [config.modes],
+    settings=lambda config: [config.modes.key],
     run=decompose,
     results=lambda run: [run.modes_by_strength.path, run.modes.path, run.decomposition.path],
     warnings=_warnings,

@@ -25,9 +25,13 @@ def learner_of(run: Run) -> Learner:
 
 def train_networks(run: Run) -> None:
     """Write ``networks/``: one file for each network and all histories; files that are no longer needed are removed.
+    Straight-line models have no network to train.
     Raises SamplesError if there are too few samples to learn from.
     """
     directory = run.directory
+    if directory.straight_kind():
+        directory.histories.write({})
+        return
     kinds = {"joint samples": directory.samples}
     kinds |= {
         f"samples of factor {name!r}": directory.factor_samples(j) for j, name in enumerate(run.collection.factors)

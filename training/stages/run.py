@@ -203,15 +203,20 @@ def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], sho
         for path in filter(Path.is_dir, stage.results(directory)):
             shutil.rmtree(path)
     begun = keys | {"version": stage.version}
+    before = directory.spent(name, keys["key"])
     directory.stamp(name).write(begun)
-    directory.log("begin", stage=name)
+    directory.log("begin", stage=name, key=keys["key"])
     show(f"{name} …")
     start = time.monotonic()
     if stage.meshes_only and run.by_design:
         directory.log("skipped", why="the generator gives factors and bounds itself")
     else:
-        stage.run(run)
-    seconds = time.monotonic() - start
+        try:
+            stage.run(run)
+        except BaseException:
+            directory.log("stopped", stage=name)
+            raise
+    seconds = before + time.monotonic() - start
     directory.stamp(name).write(begun | {"seconds": seconds, "files": written(stage, directory)})
     directory.log("end", stage=name, seconds=round(seconds, 3))
     show(f"{name}: {seconds:.0f} s")

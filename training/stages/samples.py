@@ -13,28 +13,36 @@ from shapespace.mesh.triangle_quality import folded_anew
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, KNOWN, columns, indices, parts, split, used
+from shapespace.training.space.generalisation import RANDOM
 from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning
 
+#: Most samples of a straight-line model.
+STRAIGHT_SAMPLES = RANDOM
 #: A factor is named as the cause if lost codes lie farther from 0 in it than other codes, by this share of the box.
 CLEARLY_FARTHER = 0.05
 
 
 def draw_samples(run: Run) -> None:
-    """Write the folder ``samples/``: joint samples, the collection's shapes, each factor's samples, and the split."""
+    """Write the folder ``samples/``: joint samples, the collection's shapes, each factor's samples, and the split.
+
+    Nothing is learned from samples of straight lines. A few joint samples measure the model.
+    """
     settings, coordinates = run.config.samples, run.collection.coordinates
     directory, folder = run.directory, run.directory.samples
     code_rng, split_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2))
-    own = settings.own(len(run.collection.factors))
-    codes = coordinates.uniform(max(settings.count, *own), code_rng)
-    run.draw(folder, codes[: settings.count], "joint samples", shorten=True)
+    straight = directory.straight_kind()
+    count = min(settings.count, STRAIGHT_SAMPLES) if straight else settings.count
+    own = [] if straight else settings.own(len(run.collection.factors))
+    codes = coordinates.uniform(max([count, *own]), code_rng)
+    run.draw(folder, codes[:count], "joint samples", shorten=True)
     known = run.collection.codes
-    if wanted := min(len(known), settings.count // 4) * settings.shapes:
+    if wanted := 0 if straight else min(len(known), count // 4) * settings.shapes:
         chosen = np.linspace(0, len(known) - 1, wanted).round().astype(int)
         run.draw(folder / KNOWN, known[chosen], "samples at the collection's shapes", shorten=True)
     else:
         shutil.rmtree(folder / KNOWN, ignore_errors=True)
     codes = used(folder, codes)
-    for j, (index, count) in enumerate(zip(run.collection.factors.values(), own, strict=True)):
+    for j, (index, count) in enumerate(zip(run.collection.factors.values(), own, strict=not straight)):
         run.draw(directory.factor_samples(j), alone(codes[:count], index), f"samples of factor {j}", shorten=True)
     rows = split(indices(folder), settings.test_fraction, settings.validation_fraction, split_rng)
     directory.split.write(**rows)

@@ -8,14 +8,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from shapespace.arrays import FloatArray
-from shapespace.training.collection.generators import PRODUCTS
-from shapespace.training.runs.config import Config
+from shapespace.training.collection.generators import MESHES, PRODUCTS
+from shapespace.training.collection.ingest import read_collection
+from shapespace.training.collection.mesh_collection import MeshCollection
+from shapespace.training.runs.config import Config, ConfigError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.sampling import Collection, draw
 from shapespace.training.space.shell_collection import ShellCollection
+from shapespace.training.space.straight_collection import StraightCollection
+from shapespace.training.space.straight_lines import StraightLines
 
 #: A stage stops the run if it loses a larger share of its logarithms or samples.
 TOLERATED_LOSS = 0.25
@@ -41,6 +46,16 @@ def listed(names: list[str]) -> str:
     """Return the first names, and the number of the others."""
     more = f" and {len(names) - LISTED_NAMES} more" if len(names) > LISTED_NAMES else ""
     return ", ".join(names[:LISTED_NAMES]) + more
+
+
+def read_meshes(config: Config) -> MeshCollection:
+    """Read the collection of a run; raises ConfigError where none is named, IngestError where it can't be used."""
+    settings = config.collection
+    if settings.generator is not None:
+        return MESHES[settings.generator]()
+    if settings.data is None:
+        raise ConfigError("collection.data is missing: set it to the folder of the meshes, or give --data")
+    return read_collection(settings.data, settings.parts, settings.file)
 
 
 class Run:
@@ -73,17 +88,30 @@ class Run:
         if generator in PRODUCTS:
             return PRODUCTS[generator]()
         factors, modes = self.directory.factors.read(), self.directory.modes.read()
+        grouped = dict(zip(factors["names"], factors["factors"], strict=True))
+        scale, codes = float(self.directory.reference.read()["scale"]), self.directory.training_codes()
+        if kind := self.directory.straight_kind():
+            field = modes["vertices"] if kind == "vertices" else modes["nric"]
+            lines = StraightLines(
+                kind=kind,
+                reference=self.directory.mean_mesh(),
+                mean=modes["mean"],
+                modes=field.reshape(len(field), -1),
+                weights=np.ones(modes["mean"].shape),
+                coefficients=codes,
+            )
+            return StraightCollection(lines, modes["lower"], modes["upper"], grouped, scale)
         return ShellCollection(
             reference=self.directory.mean_mesh(),
             modes=modes["vertices"],
             lower=modes["lower"],
             upper=modes["upper"],
-            factors=dict(zip(factors["names"], factors["factors"], strict=True)),
+            factors=grouped,
             steps=self.config.samples.steps or self.directory.steps(),
             first_step=self.config.exponential.first_step,
             material=self.config.shell_material,
-            scale=float(self.directory.reference.read()["scale"]),
-            codes=self.directory.training_codes(),
+            scale=scale,
+            codes=codes,
         )
 
     @property

@@ -13,7 +13,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.training.collection.mirror import TOLERANCE, find_mirror, mirrored
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.generalisation import held_out
+from shapespace.training.space.held_out import held_out
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
 

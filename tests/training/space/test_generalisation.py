@@ -9,12 +9,12 @@ from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.generalisation import (
     PrincipalComponents,
     folds,
-    held_out,
     summary,
     time_steps,
     to_nearest,
     vertex_distances,
 )
+from shapespace.training.space.held_out import held_out
 from tests.training.conftest import STEPS, bent
 
 

@@ -53,3 +53,24 @@ def test_each_stage_has_one_file() -> None:
     files = {path.stem for path in Path(stages.__path__[0]).glob("*.py")} - {"__init__", "results", "run", "stage"}
     assert files == STAGES.keys()
     assert list(STAMPS["figure"]) == list(STAGES)
+
+
+def test_the_time_of_a_stage_adds_up_over_calls(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    lines = [
+        ("begin", "samples", "a", 0),
+        ("progress", None, None, 20),  # killed here
+        ("begin", "samples", "a", 100),
+        ("stopped", "samples", None, 105),
+        ("begin", "samples", "b", 200),  # other settings
+        ("progress", None, None, 230),
+    ]
+    run.begin()
+    with (tmp_path / "log.jsonl").open("w") as log:
+        for event, stage, key, second in lines:
+            time = f"2026-01-01T00:{second // 60:02}:{second % 60:02}.000+00:00"
+            log.write(json.dumps({"time": time, "event": event, "stage": stage, "key": key}) + "\n")
+        log.write('{"event": "progress"}\n')
+    assert (run.spent("samples", "a"), run.spent("samples", "b"), run.spent("mean", "a")) == (25, 30, 0)
+    run.log("end", stage="samples")
+    assert run.spent("samples", "a") == 0

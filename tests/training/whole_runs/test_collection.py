@@ -88,7 +88,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     unseen, encoded = (json.loads((run / f"{name}.json").read_text()) for name in ("generalisation", "encoded"))
     assert figures["generalisation"] == unseen
     assert (unseen["held_out"], unseen["counts"]) == (6, [2, 3])
-    for kind in ("modes", "components"):
+    for kind in ("modes", "components", "remembering_components", "linear_nric"):
         fewer, more = (each["mean"] for each in unseen[kind])
         assert 0 < more < fewer < 0.1
     assert unseen["stuck"] == 0
@@ -102,7 +102,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     assert 0 < figures["specificity"]["components"] < 0.2
     assert 0.5 < figures["compactness"]["modes"] <= 1
     assert 0.5 < figures["compactness"]["components"] <= 1
-    assert (encoded["shapes"], encoded["outside"]) == (6, [])
+    assert (encoded["shapes"], encoded["outside"], encoded["mesh"]) == (6, [], "fine")
     assert 0 < encoded["mean"] < encoded["p95"] < 0.02
     # What modes and these hasty networks miss is remembered; the fine mesh is still carried along.
     assert encoded["remembered"]

@@ -17,6 +17,7 @@ from shapespace.training.learning.combiners.correction import Correction, JointS
 from shapespace.training.learning.combiners.fields import FieldCorrection
 from shapespace.training.learning.combiners.kernels import KernelCorrection
 from shapespace.training.learning.combiners.products import ProductCorrection
+from shapespace.training.learning.combiners.sums import SumCorrection
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import principal_axes
 from shapespace.training.learning.networks import ShapeNetwork, predict
@@ -35,6 +36,7 @@ from shapespace.training.runs.network_settings import (
 CORRECTIONS: dict[str, type[Correction]] = {
     "kernel": KernelCorrection,
     "products": ProductCorrection,
+    "sum": SumCorrection,
     "convolutions": ConvolutionCorrection,
     "field": FieldCorrection,
 }

@@ -1,0 +1,74 @@
+"""The choice between straight lines and exponentials."""
+
+import numpy as np
+import pytest
+
+from shapespace.shell.energy import Material
+from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space.geometry import certain, cheapest, choose_geometry
+from shapespace.training.space.held_out import held_out
+from shapespace.training.space.modes import most_modes
+from tests.training.conftest import bent
+
+AUTO = ModeSettings(geometry="auto")
+
+
+def test_sums_of_displacements_are_straight_lines_of_vertices(blends):
+    mesh, large = blends
+    # Large displacements would turn the shapes, so that alignment adds to the directions in which they differ.
+    shapes = mesh.vertices + 0.2 * (large - mesh.vertices)
+    found = choose_geometry(AUTO, mesh, shapes, Material())
+    assert (found.kind, found.steps, found.count) == ("vertices", 1, 3)
+    assert found.errors["vertices"] <= 1.02 * min(found.errors.values())
+    assert found.folded == 0
+    again = held_out(mesh, shapes, np.array([0, 5]), None, AUTO, Material())
+    assert (again.counts, again.steps.tolist()) == ([2, 3], [1, 1])
+    away = again.distances(shapes, mesh.diagonal)
+    assert away.keys() == {"modes", "components", "remembering_components", "linear_nric"}
+    assert away["modes"][1].mean() <= 1.01 * away["components"][1].mean()
+
+
+def test_shapes_that_bend_are_no_straight_lines_of_vertices(ellipsoid):
+    shapes = bent(ellipsoid, np.linspace(-1, 1, 8))
+    found = choose_geometry(ModeSettings(geometry="auto", count=1), ellipsoid, shapes, Material())
+    assert found.kind != "vertices"
+    assert found.errors[found.kind] < 0.5 * found.errors["vertices"]
+    few = choose_geometry(AUTO, ellipsoid, shapes[:4], Material())
+    assert (few.kind, few.errors) == ("exponential", {}), "too few to tell"
+    asked = choose_geometry(ModeSettings(geometry="nric", count=2), ellipsoid, shapes, Material())
+    assert (asked.kind, asked.count, asked.errors) == ("nric", 2, {})
+    assert choose_geometry(ModeSettings(log_steps=3), ellipsoid, shapes, Material()).steps == 3
+
+
+@pytest.mark.parametrize(
+    ("errors", "folded", "chosen"),
+    [
+        ((1.015, 1.0, 1.1), 0, "vertices"),
+        ((1.03, 1.015, 1.0), 0, "nric"),
+        ((1.03, 1.03, 1.0), 0, "exponential"),
+        ((1.0, 1.05, 1.02), 0.5, "exponential"),
+        ((0.9, 1.0, 1.0), 0.5, "vertices"),
+        ((1.0, None, None), 0.5, "vertices"),
+        ((None, None, 1.0), 0, "exponential"),
+        ((None, None, None), 0, "exponential"),
+    ],
+)
+def test_the_cheapest_map_is_chosen_that_is_as_good_as_the_others(errors, folded, chosen):
+    kinds = zip(("vertices", "nric", "exponential"), errors, strict=True)
+    assert cheapest({kind: error for kind, error in kinds if error is not None}, folded) == chosen
+
+
+def test_folds_end_once_the_choice_is_certain(rng):
+    theirs = rng.uniform(0.5, 1.5, 10)
+    assert certain({"vertices": theirs, "exponential": theirs}, "vertices"), "equal, and cheaper"
+    assert not certain({"vertices": theirs * rng.uniform(0.9, 1.1, 10), "exponential": theirs}, "vertices")
+    assert certain({"vertices": 2 * theirs, "nric": theirs, "exponential": 1.5 * theirs}, "nric")
+    near = theirs * rng.uniform(1.0, 1.06, 10)
+    assert not certain({"nric": near, "exponential": theirs}, "exponential"), "too close to tell"
+
+
+@pytest.mark.parametrize(("count", "most"), [(3, 1), (5, 3), (10, 7), (47, 36)])
+def test_there_are_no_more_modes_than_folds_support(count, most):
+    assert most_modes(count) == most
+    images = np.concatenate([np.arange(count)] * 2)
+    assert most_modes(2 * count, images) == most, "an image is no further shape"

@@ -1,0 +1,82 @@
+"""Runs of straight-line models: nothing is trained, and the bundle is served like any other."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shapespace
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.runs.config import parse
+from shapespace.training.stages.run import execute
+from shapespace.training.stages.stage import Run
+from tests.training.conftest import bent
+
+CONFIG = """
+[collection]
+data = {data}
+mirror = false
+
+[modes]
+geometry = "{geometry}"
+count = 2
+
+[evaluation]
+reconstructions = 2
+
+[export]
+name = "straight"
+title = "Straight"
+description = "A run for the tests."
+licence = "MIT"
+examples = {examples}
+"""
+
+
+@pytest.mark.parametrize(("geometry", "examples"), [("vertices", False), ("nric", True)])
+def test_a_straight_line_model_is_served_without_training(
+    blends: tuple[TriangleMesh, np.ndarray], ellipsoid: TriangleMesh, tmp_path: Path, geometry: str, examples: bool
+) -> None:
+    mesh, shapes = blends if geometry == "vertices" else (ellipsoid, bent(ellipsoid, np.linspace(-1, 1, 6)))
+    data = tmp_path / "shapes.npz"
+    np.savez(data, vertices=shapes, faces=mesh.faces)
+    text = CONFIG.format(data=json.dumps(str(data)), geometry=geometry, examples=str(examples).lower())
+    run = Run(tmp_path / "run", parse(text, "straight.toml"), text, tmp_path / "models")
+    said: list[str] = []
+    assert execute(run, show=said.append)
+    assert not run.directory.networks()
+    lines, scale = run.collection.lines, run.collection.scale
+    model = shapespace.load(run.bundle)
+    assert [factor.name for factor in model.manifest.factors] == ["whole shape"]
+    assert model.manifest.exponential_steps == (1 if geometry == "vertices" else None)
+    size = np.ptp(model.decode(np.zeros(2)), axis=0).max()
+    if examples:
+        # Memory brings training shapes back that two straight lines do not have.
+        found = [model.decode(code) for code in run.collection.codes]
+        errors = [np.abs(align(shape, near) - near).max() / size for shape, near in zip(shapes, found, strict=True)]
+        assert max(errors) < 2e-3
+    else:
+        for code in (np.array([0.5, -0.7]), lines.coefficients[0], 1.2 * run.collection.upper):
+            served = model.decode(code)
+            expected = align(scale * lines.shape(code)[0], served)
+            assert np.abs(served - expected).max() < 1e-4 * size
+    code = 0.3 * run.collection.upper
+    step = 1e-3 * np.eye(2)[0]
+    slope = (align(model.decode(code + step), model.decode(code - step)) - model.decode(code - step)) / 2e-3
+    assert np.abs(model.jacobian(code)[..., 0] - slope).max() < 0.05 * np.abs(slope).max()
+    figures = run.directory.evaluation.read()
+    assert figures["r2"]["composite"]["total"] > (0.999 if geometry == "vertices" else 0.99)
+    assert {"components", "remembering_components", "linear_nric"} <= figures["generalisation"].keys()
+    assert run.directory.geometry.read()["kind"] == geometry
+    assert not execute(run, show=said.append), "nothing is left to do"
+    report = _report(run)
+    assert "Codes make shapes by straight lines of " in report
+    assert "PCA with memory" in report
+
+
+def _report(run: Run) -> str:
+    from shapespace.training.report.page import write_report
+
+    return write_report(run.directory).read_text()

@@ -1,0 +1,232 @@
+"""The map from codes to shapes, chosen for a collection: straight lines, or exponentials."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import dihedral_angles
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.mesh.triangle_quality import folded_anew
+from shapespace.shell.energy import Material
+from shapespace.shell.space import FirstStep, ShellSpace
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.generalisation import (
+    CHOICE_SHAPES,
+    FOLDED_MODES,
+    FOLDED_SHAPES,
+    FOLDED_SHARE,
+    FOLDS,
+    LIGHT_STEPS,
+    STEPS,
+    folds,
+    space_of,
+    time_steps,
+    vertex_distances,
+)
+from shapespace.training.space.modes import ModeError, coefficients, left_of_held_out, mode_count, pga, worthwhile
+from shapespace.training.space.straight_lines import StraightKind, StraightLines
+
+Kind = Literal["vertices", "nric", "exponential"]
+#: All maps, the cheapest first.
+COST: tuple[Kind, ...] = ("vertices", "nric", "exponential")
+#: A cheaper map is chosen if its error is at most this multiple of the least error.
+AS_GOOD = 1.02
+#: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
+#: their error.
+FOLDED_BETTER = 1.05
+#: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
+#: errors from changing the choice, with at least this number of shapes.
+CERTAIN, ENOUGH = 3, 8
+
+
+@dataclass(frozen=True)
+class GeometryChoice:
+    """The chosen map, and what it was chosen by."""
+
+    kind: Kind
+    steps: int  # K of exponentials, 1 for straight lines
+    count: int | None = None  # number of modes of straight lines
+    compared: int | None = None  # number of modes of all maps in the comparison
+    held_out: int = 0  # number of shapes in the comparison
+    # mean distance of each map from these shapes, as a share of the diagonal
+    errors: dict[Kind, float] = field(default_factory=dict)
+    folded: float = 0.0  # share of random shapes that fold on straight lines of vertices
+
+    @property
+    def light_steps(self) -> int:
+        """K where spaces are compared."""
+        return min(LIGHT_STEPS, self.steps)
+
+
+def choose_geometry(
+    settings: ModeSettings,
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    material: Material,
+    original_index: IntArray | None = None,
+    first_step: FirstStep = "centred",
+) -> GeometryChoice:
+    """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
+
+    ``modes.geometry = "auto"`` compares three maps on shapes that are held out of the modes in inner folds: straight
+    lines of vertices, straight lines of lengths and angles, and exponentials. All have the same number of modes, the
+    smallest that one of them would have. The cheapest map is chosen whose error is at most 2 % above the least.
+    Means come from all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
+
+    ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
+    """
+    original_index = np.arange(len(shapes)) if original_index is None else original_index
+    if settings.geometry == "exponential":
+        steps = time_steps(settings, reference, shapes, material, original_index, first_step)
+        return GeometryChoice("exponential", steps)
+    if settings.geometry != "auto":
+        lines = StraightLines.of(settings.geometry, shapes, reference)
+        lines.require_mean(reference)
+        return GeometryChoice(settings.geometry, 1, straight_count(settings, lines, shapes, original_index))
+    if original_index.max() + 1 < FOLDS:  # too few to choose
+        return GeometryChoice("exponential", _many(settings, first_step))
+    return _Comparison(settings, reference, shapes, material, original_index, first_step).choice()
+
+
+def _many(settings: ModeSettings, first_step: FirstStep) -> int:
+    """Return K of exponentials, which bend."""
+    if settings.log_steps != "auto":
+        return settings.log_steps
+    return LIGHT_STEPS if first_step == "centred" else STEPS
+
+
+def straight_count(settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray) -> int:
+    """Return the number of modes of straight lines, as configured or by cross-validation.
+
+    Errors are measured on vertices at the mean, see `mode_count`.
+    """
+    if settings.count != "auto":
+        return max(1, min(settings.count, len(lines)))
+    motions = lines.motions(shapes)
+    return min(worthwhile(left_of_held_out(motions @ motions.T, original_index), original_index), len(lines))
+
+
+#: Map from indices of the shapes that modes are found from, indices of unseen shapes, and a number of modes, to the
+#: nearest shapes (k, V, 3).
+_Nearest = Callable[[IntArray, IntArray, int], FloatArray]
+
+
+class _Comparison:
+    """Errors of all maps on the same held-out shapes."""
+
+    def __init__(
+        self,
+        settings: ModeSettings,
+        reference: TriangleMesh,
+        shapes: FloatArray,
+        material: Material,
+        original_index: IntArray,
+        first_step: FirstStep,
+    ) -> None:
+        self._settings, self._reference, self._shapes, self._material = settings, reference, shapes, material
+        self._original_index = original_index
+        used = original_index % -(-(original_index.max() + 1) // CHOICE_SHAPES) == 0
+        self._some, self._own = shapes[used], np.unique(original_index[used], return_inverse=True)[1]
+        self._steps, self._first_step = _many(settings, first_step), first_step
+        self._light = min(LIGHT_STEPS, self._steps)
+
+    def choice(self) -> GeometryChoice:
+        """Compare the maps fold by fold, until the choice is certain."""
+        settings, lines = self._settings, self._lines()
+        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
+        try:
+            at = space_of(self._reference, self._some, self._material, self._light, self._first_step)
+            counts = [mode_count(settings, *at, self._own)]
+            maps["exponential"] = partial(self._on_exponentials, *at)
+        except (ModeError, NotPositiveDefiniteError):  # exponentials have no mean
+            if not lines:  # the stages that need a mean report it
+                return GeometryChoice("exponential", self._steps)
+            counts = []
+        every = folds(int(self._own.max()) + 1)
+        own = {kind: straight_count(settings, each, self._shapes, self._original_index) for kind, each in lines.items()}
+        count = max(1, min(*counts, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
+        away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
+        kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
+        for index in every:
+            kept, held_out = np.flatnonzero(~np.isin(self._own, index)), held_out + len(index)
+            for each in list(away):
+                with suppress(ModeError, NotPositiveDefiniteError):
+                    near, given = maps[each](kept, index, count), self._some[index]
+                    distances = vertex_distances(near, given, self._reference.diagonal).mean(axis=1)
+                    away[each] = np.concatenate([away[each], distances])
+                    continue
+                del away[each]
+            errors = {each: float(distances.mean()) for each, distances in away.items()}
+            kind = cheapest(errors, folded)
+            if held_out >= ENOUGH and certain(away, kind):
+                break
+        steps, modes = (self._steps, None) if kind == "exponential" else (1, own[kind])
+        return GeometryChoice(kind, steps, modes, count, held_out, errors, folded)
+
+    def _on_lines(self, kind: StraightKind, kept: IntArray, index: IntArray, count: int) -> FloatArray:
+        """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
+        lines = StraightLines.of(kind, self._some, self._reference, kept)
+        return lines.first(count).nearest(self._some[index]).vertices
+
+    def _on_exponentials(
+        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, kept: IntArray, index: IntArray, count: int
+    ) -> FloatArray:
+        """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
+        modes = pga(space, mean, fields[kept], count, "vertices").vertices
+        start, _ = coefficients(space, mean, fields[index], modes, "vertices")
+        return nearest_codes(space, mean, modes, self._some[index], start, self._light).vertices
+
+    def _lines(self) -> dict[StraightKind, StraightLines]:
+        found: dict[StraightKind, StraightLines] = {}
+        for kind in ("vertices", "nric"):
+            try:
+                lines = StraightLines.of(kind, self._shapes, self._reference)
+                lines.require_mean(self._reference)
+            except (ModeError, NotPositiveDefiniteError):
+                continue
+            found[kind] = lines
+        return found
+
+    def _folded(self, lines: StraightLines) -> float:
+        """Return the share of random shapes that fold where no training shape has a crease."""
+        lower, upper = box_of(lines.coefficients)
+        codes = np.random.default_rng(0).uniform(lower, upper, (FOLDED_SHAPES, len(lines)))
+        drawn = (lines.mean + codes @ lines.modes).reshape(FOLDED_SHAPES, -1, 3)
+        angles, others = (dihedral_angles(each, self._reference.connectivity) for each in (drawn, self._shapes))
+        return float(folded_anew(angles, others).mean())
+
+
+def cheapest(errors: dict[Kind, float], folded: float) -> Kind:
+    """Return the cheapest map that is as good as the others, from errors by map.
+
+    Straight lines of vertices whose random shapes often fold must be better than the others.
+    """
+    if not errors:
+        return "exponential"
+    kinds = [kind for kind in COST if kind in errors]
+    others = [errors[kind] for kind in kinds if kind != "vertices"]
+    if "vertices" in errors and folded > FOLDED_SHARE and others and FOLDED_BETTER * errors["vertices"] > min(others):
+        kinds.remove("vertices")
+    least = min(errors[kind] for kind in kinds)
+    return next(kind for kind in kinds if errors[kind] <= AS_GOOD * least)
+
+
+def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
+    """Return whether further shapes would not change the choice, from errors (n,) of the same shapes by each map."""
+    for other, theirs in errors.items():
+        if other != kind:
+            cheaper = COST.index(kind) < COST.index(other)
+            gaps = AS_GOOD * theirs - errors[kind] if cheaper else theirs - AS_GOOD * errors[kind]
+            if gaps.mean() < CERTAIN * gaps.std() / np.sqrt(len(gaps)):
+                return False
+    return True

@@ -1,0 +1,182 @@
+"""Held-out shapes, approximated in the space that was found without them, and by simple models.
+
+The simple models know the same shapes, have as many coordinates, and find codes by vertices, as our model does:
+
+- ``components``: principal components of the aligned vertices.
+- ``remembering_components``: principal components that remember the shapes they were found from, as our bundles do.
+- ``linear_nric``: principal components of lengths and angles, with vertices by Gauss–Newton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.shell.energy import Material
+from shapespace.shell.space import FirstStep
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.outcome import Status
+from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space.codes import Codes, nearest_codes
+from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
+from shapespace.training.space.geometry import GeometryChoice, choose_geometry
+from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.memory import RememberingLines
+from shapespace.training.space.modes import ModeError, coefficients, mode_count
+from shapespace.training.space.sparse_modes import find_modes
+from shapespace.training.space.straight_lines import StraightLines
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out shapes, approximated in the space that was found without them."""
+
+    index: IntArray  # (k,) indices of the shapes in the collection
+    counts: Sequence[float]  # numbers of modes
+    # (k, V, 3) for each number: ``modes`` has the nearest shapes of the space. The simple models follow. Where there
+    # are mirror images, ``components`` don't know them, but ``mirrored_components`` and the other models do
+    near: dict[str, list[FloatArray]]
+    steps: IntArray  # (k,) K of the exponentials, 1 for straight lines
+    # (k,) for each number: whether the search did not converge, because faces of exponentials collapse
+    stuck: list[NDArray[np.bool_]]
+
+    def distances(self, shapes: FloatArray, diagonal: float) -> dict[str, list[FloatArray]]:
+        """Return distances to the shapes (n, V, 3) of the collection: (k, V) for each kind and number of modes."""
+        given = shapes[self.index]
+        return {kind: [vertex_distances(each, given, diagonal) for each in found] for kind, found in self.near.items()}
+
+
+def joined(parts: Sequence[HeldOut]) -> HeldOut:
+    """Join the shapes of several folds. The numbers of modes are means."""
+
+    def together(by_count: Iterable[list[NDArray]]) -> list[NDArray]:
+        return [np.concatenate(each) for each in zip(*by_count, strict=True)]
+
+    return HeldOut(
+        index=np.concatenate([part.index for part in parts]),
+        counts=np.mean([part.counts for part in parts], axis=0).tolist(),
+        near={
+            kind: together(part.near[kind] for part in parts)
+            for kind in parts[0].near
+            if all(kind in part.near for part in parts)
+        },
+        steps=np.concatenate([part.steps for part in parts]),
+        stuck=together(part.stuck for part in parts),
+    )
+
+
+def held_out(
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    index: IntArray,
+    counts: Sequence[int] | None,
+    settings: ModeSettings,
+    material: Material,
+    steps: int | None = None,
+    original: IntArray | None = None,
+    first_step: FirstStep = "centred",
+) -> HeldOut:
+    """Find mean and modes without some shapes, and approximate these shapes.
+
+    Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
+    shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
+    number of the other shapes. The map from codes to shapes is as configured for the other shapes. ``steps`` is K, by
+    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. Raises ModeError if the other
+    shapes have no mean, or no modes.
+    """
+    original = np.arange(len(shapes)) if original is None else original
+    known = np.flatnonzero(~np.isin(original, index))
+    kept, unseen = shapes[known], shapes[index]
+    original_index = np.unique(original[known], return_inverse=True)[1]
+    if steps is None:
+        choice = choose_geometry(settings, reference, kept, material, original_index, first_step)
+    else:
+        choice = GeometryChoice("exponential", steps)
+    space: _Exponentials | StraightLines
+    if choice.kind == "exponential":
+        steps = choice.light_steps
+        space = _Exponentials(settings, reference, kept, unseen, original_index, material, steps, first_step)
+        count = space.count if choice.count is None else choice.count
+    else:
+        space = StraightLines.of(choice.kind, kept, reference)
+        count = choice.count or len(space)
+    rivals = simple_models(reference, kept, original[known] == known)
+    reached, stuck = [], []
+    near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
+    for each in [-(-count // 2), count] if counts is None else counts:
+        found = space.first(min(each, len(kept) - 1)).nearest(unseen)
+        reached.append(found.codes.shape[1])
+        near["modes"].append(found.vertices)
+        stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
+        for kind, nearest in rivals.items():
+            near[kind].append(nearest(unseen, reached[-1]))
+    return HeldOut(index, reached, near, np.full(len(index), choice.light_steps), stuck)
+
+
+#: Map from shapes (k, V, 3) and a number of coordinates to the nearest shapes (k, V, 3) of a simple model.
+SimpleModel = Callable[[FloatArray, int], FloatArray]
+
+
+def simple_models(reference: TriangleMesh, kept: FloatArray, own: NDArray[np.bool_]) -> dict[str, SimpleModel]:
+    """Return functions that approximate shapes (k, V, 3) with a number of coordinates, by the names of simple models.
+
+    Lines of lengths and angles are left out where their mean has no shape. ``own`` (n,) marks shapes (n, V, 3) that
+    are no mirror images.
+    """
+    rivals: dict[str, SimpleModel] = {"components": PrincipalComponents.of(kept[own], reference.vertices).nearest}
+    if not own.all():
+        rivals["mirrored_components"] = PrincipalComponents.of(kept, reference.vertices).nearest
+    straight = StraightLines.of("vertices", kept, reference)
+    rivals["remembering_components"] = lambda some, m: RememberingLines(straight.first(m), kept).nearest(some)
+    with suppress(ModeError, NotPositiveDefiniteError):
+        lengths_and_angles = StraightLines.of("nric", kept, reference)
+        rivals["linear_nric"] = lambda some, m: lengths_and_angles.first(m).nearest(some).vertices
+    return rivals
+
+
+class _Exponentials:
+    """Exponentials at the mean of shapes (n, V, 3), which approximate unseen shapes (k, V, 3)."""
+
+    _modes: FloatArray  # (m, V, 3)
+
+    def __init__(
+        self,
+        settings: ModeSettings,
+        reference: TriangleMesh,
+        kept: FloatArray,
+        unseen: FloatArray,
+        original_index: IntArray,
+        material: Material,
+        steps: int,
+        first_step: FirstStep,
+    ) -> None:
+        self._settings, self._original_index, self._steps = settings, original_index, steps
+        self._space, self._mean, self._fields = space_of(reference, kept, material, steps, first_step)
+        # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far
+        # shape.
+        self._towards = logarithms(self._space, self._mean, unseen, steps).fields
+
+    @property
+    def count(self) -> int:
+        """Number of modes, as configured."""
+        return mode_count(self._settings, self._space, self._mean, self._fields, self._original_index)
+
+    def first(self, count: int) -> _Exponentials:
+        """Return the exponentials along this number of modes."""
+        found = copy(self)
+        found._modes = find_modes(
+            self._settings, self._space, self._mean, self._fields, count, self._original_index
+        ).vertices
+        return found
+
+    def nearest(self, unseen: FloatArray) -> Codes:
+        """Return the codes of the unseen shapes."""
+        start, _ = coefficients(self._space, self._mean, self._towards, self._modes, self._settings.norm)
+        return nearest_codes(self._space, self._mean, self._modes, unseen, start, self._steps)

@@ -1,0 +1,212 @@
+"""Straight lines of shapes: ``x̄ + Σ_j w_j u_j`` in aligned vertices, or in lengths and angles.
+
+These are the cheapest maps from codes to shapes. They need no exponential and no samples:
+
+- "vertices": x̄ is the arithmetic mean of aligned shapes, and the u_j are their principal components. Modes add up as
+  blend shapes do.
+- "nric": x̄ is the mean of lengths and angles (NRIC), and the u_j are principal components in the weighted norm of
+  reconstruction. Gauss–Newton finds the vertices. Limbs can bend, but an angle changes in proportion to the code.
+
+Mirror images may be among the shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, Literal
+
+import numpy as np
+
+from shapespace.arrays import FloatArray, IntArray
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric, unwrap
+from shapespace.coordinates.reconstruction import DEFAULT_ETA, Reconstructor
+from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas
+from shapespace.solve.cholesky import NotPositiveDefiniteError
+from shapespace.solve.outcome import Status
+from shapespace.training.runs.workers import run
+from shapespace.training.space.codes import Codes, NearestCode, gathered, nearest_code
+from shapespace.training.space.modes import NEGLIGIBLE, ModeError
+
+StraightKind = Literal["vertices", "nric"]
+#: Tolerance of vertices from lengths and angles, as a share of the diagonal.
+TOLERANCE = 1e-6
+#: Most Gauss–Newton steps for a shape. Shapes near the training shapes take at most 30; a search that tries codes far
+#: from them takes a shorter step instead.
+ITERATIONS = 60
+#: Shapes that differ by less than this share of the mean are the same.
+ROUNDING = 1e-9
+#: Smallest area of a face of the mean, as a share of its area in the reference: below it the mean has collapsed.
+LEAST_AREA = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class StraightLines:
+    """Straight lines through the mean of shapes, in vertices or in lengths and angles. Modes are sorted by strength.
+
+    It is pickled without its solver. A process that unpickles it makes its own, at the first shape.
+    """
+
+    kind: StraightKind
+    reference: TriangleMesh  # the shape of the code 0, at the position of the collection's reference
+    mean: FloatArray  # (q,) x̄, flat vertices or NRIC
+    modes: FloatArray  # (m, q) u_j, scaled so that the largest coefficient of a shape is 1
+    weights: FloatArray  # (q,) weights of squares in the norm
+    coefficients: FloatArray  # (n, m) orthogonal projections of the shapes
+    eta: float = DEFAULT_ETA  # weight of the angles
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_reconstruct"}
+
+    @classmethod
+    def of(
+        cls,
+        kind: StraightKind,
+        shapes: FloatArray,
+        reference: TriangleMesh,
+        kept: IntArray | None = None,
+        eta: float = DEFAULT_ETA,
+    ) -> StraightLines:
+        """Find the mean of shapes (n, V, 3) in any position, and all principal modes of the shapes ``kept``, or of all.
+
+        Raises ModeError if the shapes have no such mean, or are all the same.
+        """
+        if not np.isfinite(shapes).all():
+            raise ModeError("a shape has a coordinate that is not finite")
+        if kind == "vertices":
+            shapes = align(shapes, align(shapes, reference.vertices).mean(axis=0))
+            rows = shapes.reshape(len(shapes), -1)
+            mean = rows.mean(axis=0)
+            centre, weights = mean.reshape(-1, 3), np.ones(len(mean))
+        else:
+            rows = nric(shapes, reference.connectivity)
+            angles = rows[:, rows.shape[1] // 2 :]
+            middle = np.arctan2(np.sin(angles).mean(axis=0), np.cos(angles).mean(axis=0))
+            rows = unwrap(rows, np.concatenate([rows[0, : len(middle)], middle]))
+            mean = rows.mean(axis=0)
+            # Weights at the reference first: the mean's own weights need its shape.
+            centre = _shape_of_mean(reference, eta, mean)
+            weights = WeightedNorm.of(reference.with_vertices(centre), eta).squared
+        centre = align(centre, reference.vertices)
+        if not np.isfinite(weights).all():
+            raise ModeError("a face of the mean has no area")
+        if kind == "vertices":
+            # The mean in its final position, with the shapes around it.
+            rows = align(shapes, centre).reshape(len(shapes), -1)
+            mean = centre.ravel()
+        offsets = (rows - mean) * np.sqrt(weights)
+        some = offsets if kept is None else offsets[kept]
+        u, s, axes = np.linalg.svd(some, full_matrices=False)
+        number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
+        if s[0] <= ROUNDING * np.sqrt((mean**2) @ weights):
+            raise ModeError("there are no modes: all shapes are the same as the mean")
+        coefficients = (u * s)[:, :number]
+        peaks = coefficients[np.abs(coefficients).argmax(axis=0), np.arange(number)]
+        plain = np.divide(axes[:number], np.sqrt(weights), out=np.zeros_like(axes[:number]), where=weights > 0)
+        return cls(
+            kind=kind,
+            reference=reference.with_vertices(centre),
+            mean=mean,
+            modes=plain * peaks[:, None],
+            weights=weights,
+            coefficients=coefficients / peaks,
+            eta=eta,
+        )
+
+    def __len__(self) -> int:
+        return len(self.modes)
+
+    def require_mean(self, reference: TriangleMesh) -> None:
+        """Raise ModeError if a face of the mean has collapsed, compared with a reference: no model can have it."""
+        areas = face_areas(self.reference.vertices, reference.faces)
+        if not (areas > LEAST_AREA * reference.face_areas).all():
+            raise ModeError("a face of the mean has collapsed")
+
+    def first(self, count: int) -> StraightLines:
+        """Return the lines along the strongest modes alone."""
+        return replace(self, modes=self.modes[:count], coefficients=self.coefficients[:, :count])
+
+    @cached_property
+    def explained(self) -> FloatArray:
+        """Shares (m,) of these modes in the variance that all of them explain."""
+        energies = self.squares * (self.coefficients**2).sum(axis=0)
+        return energies / energies.sum()
+
+    @property
+    def squares(self) -> FloatArray:
+        """``‖u_j‖²`` (m,)."""
+        return (self.modes**2) @ self.weights
+
+    @cached_property
+    def fields(self) -> FloatArray:
+        """Vertex fields (m, V, 3) of the modes at the reference."""
+        if self.kind == "vertices":
+            return self.modes.reshape(len(self), -1, 3)
+        return self._reconstruct.differential(self.reference.vertices, self.modes)
+
+    @cached_property
+    def nric(self) -> FloatArray:
+        """Changes (m, 2E) of lengths and angles along the modes at the reference."""
+        if self.kind == "nric":
+            return self.modes
+        jacobian = NRICJacobian(self.reference.connectivity)
+        matrix = jacobian.matrix(jacobian.gradients(self.reference.vertices))
+        return (matrix @ self.modes.T).T
+
+    @cached_property
+    def _reconstruct(self) -> Reconstructor:
+        return Reconstructor(self.reference, self.eta)
+
+    def offsets(self, shapes: FloatArray) -> FloatArray:
+        """Return differences (n, q) between shapes (n, V, 3) in any position and the mean."""
+        if self.kind == "vertices":
+            return (align(shapes, self.reference.vertices) - self.reference.vertices).reshape(len(shapes), -1)
+        return unwrap(nric(shapes, self.reference.connectivity), self.mean) - self.mean
+
+    def motions(self, shapes: FloatArray) -> FloatArray:
+        """Return motions (n, 3V) of vertices from the mean to shapes (n, V, 3), to first order."""
+        offsets = self.offsets(shapes)
+        if self.kind == "vertices":
+            return offsets
+        return self._reconstruct.differential(self.reference.vertices, offsets).reshape(len(shapes), -1)
+
+    def project(self, shapes: FloatArray) -> FloatArray:
+        """Project shapes (n, V, 3) orthogonally onto the modes; return codes (n, m)."""
+        return (self.offsets(shapes) * self.weights) @ self.modes.T / self.squares
+
+    def shape(self, code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
+        """Return the shape (V, 3) of a code (m,), and the function that computes its derivative (m, V, 3).
+
+        None if Gauss–Newton finds no shape; the code 0 always has one.
+        """
+        values = self.mean + code @ self.modes
+        if self.kind == "vertices":
+            return values.reshape(-1, 3), lambda: self.fields
+        found = self._reconstruct.from_guess(values, tolerance=TOLERANCE, max_iterations=ITERATIONS)
+        if not found.converged and code.any():
+            return None
+        return found.vertices, lambda: self._reconstruct.differential(found.vertices, self.modes)
+
+    def nearest(self, shapes: FloatArray, workers: int = -1) -> Codes:
+        """Find the codes whose shapes come closest to shapes (n, V, 3), in vertices after rigid alignment."""
+        items = list(zip(shapes, self.project(shapes), strict=True))
+        # Lines of vertices are so fast that other processes would only cost time.
+        some = 1 if self.kind == "vertices" else workers
+        return gathered(run(partial(_nearest, self), items, workers=some), len(items))
+
+
+def _nearest(lines: StraightLines, item: tuple[FloatArray, FloatArray]) -> NearestCode:
+    return nearest_code(lines.shape, *item)
+
+
+def _shape_of_mean(reference: TriangleMesh, eta: float, mean: FloatArray) -> FloatArray:
+    """Return the shape (V, 3) nearest to the mean (2E,) of lengths and angles. Raises ModeError if there is none."""
+    try:
+        found = Reconstructor(reference, eta).from_guess(mean, tolerance=TOLERANCE)
+    except NotPositiveDefiniteError as error:
+        raise ModeError(f"the mean of lengths and angles has no shape: {error}") from None
+    if found.status is Status.NOT_FINITE:
+        raise ModeError(f"the mean of lengths and angles has no shape: {found.reason}")
+    return found.vertices
