@@ -27,8 +27,10 @@ class SettingsTable(BaseModel):
 class CollectionSettings(SettingsTable):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
-    generator: Literal["freaky-torus", "figure"] | None = None
-    """Name of a built-in generator, which makes the shapes itself."""
+    generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
+    """Name of a built-in generator, which makes the shapes itself. ``expressive`` is a body in 149 poses: 100 with
+    moving hands and face, 49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need the extra
+    ``people``."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
     one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
