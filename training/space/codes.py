@@ -65,7 +65,7 @@ def nearest_codes(
     box = Box(-everywhere, everywhere, np.ones(len(modes)))
     items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
     results = run(partial(_nearest, space, mean, modes, box, steps), items, workers=workers)
-    found = dict(progress(results, "codes", "shape", len(items)))
+    found = dict(progress(results, "finding the codes of your shapes", "shape", len(items)))
     codes, vertices, counts, status = zip(*(found[k] for k in range(len(items))), strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
 

@@ -40,6 +40,7 @@ from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import analyse
+from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.modes import ModeProblem, Modes, Norm, localisation, pga, validation_norm
 
@@ -118,7 +119,8 @@ def spga(
     enough = _sparsity_criterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
-    for share in SPARSITIES if sparsity is None else [sparsity]:
+    shares = SPARSITIES if sparsity is None else [sparsity]
+    for share in progress(shares, "finding modes that move one part each", "sparsity", len(shares)):
         price = share * highest
         if enough and share != SPARSITIES[-1]:
             tried = _alternate(problem, D, W, price, max_iterations, TRIAL_TOLERANCE, TRIAL_PATIENCE)[1]
@@ -217,7 +219,7 @@ def _alternate(
     """
     shrink = _Shrinkage(problem, D)
     history: list[dict[str, float]] = []
-    for iteration in range(max_iterations + 1):
+    for iteration in progress(range(max_iterations + 1), "improving the modes", "round, or fewer", max_iterations + 1):
         MD = problem.M @ D.T
         gram, B, norms = D @ MD, D @ problem.MD, problem.one_norms(D)
         misfit = 1 + float(np.vdot(W @ W.T, gram) - 2 * np.vdot(W, B)) / problem.total

@@ -49,7 +49,7 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
         shapes = nric(directory.shapes.read()["vertices"], directory.reference_mesh().connectivity)
         combiner = ExampleCorrectedCombiner.of(composite, directory.training_codes(), shapes)
         composite = replace(composite, combiner=combiner)
-    with waiting("bundle"):
+    with waiting("writing the bundle"):
         return export(
             composite, run.collection, run.config, figures, digest.hexdigest(), run.models, geometry, learner.start()
         )
@@ -88,7 +88,10 @@ def _encode_collection(run: Run, bundle: Path) -> None:
     directory = run.directory
     model, reference, names = shapespace.load(bundle), directory.reference_mesh(), directory.shapes.read()["names"]
     given, scale = directory.own_shapes(), float(directory.reference.read()["scale"])
-    found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
+    found = [
+        model.encode(scale * shape)
+        for shape in progress(given, "finding the codes of your shapes", "shape", len(given))
+    ]
     near = np.stack([each.shape.vertices for each in found]) / scale
     linear = PrincipalComponents.of(given, reference.vertices).nearest(given, model.latents.dimension)
     away, other = (vertex_distances(each, given, reference.diagonal) for each in (near, linear))
