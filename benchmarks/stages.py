@@ -67,16 +67,16 @@ Memory stays below 1 GB up to 40,000 vertices in the files; 500,000 vertices nee
 - **coarse shape**: CPU time that the finished model takes for a shape on the coarse mesh.
 - **fine mesh**: further time to carry the fine mesh along. Both are medians over {codes} codes.
 
-{people}The other collections are capsules that bend and bulge. `python -m benchmarks.stages` runs the real command on them,
-with one BLAS thread, and writes this page from `runs/growth.json`. Measured on {day}.
+{people}The collections of the first two tables are capsules that bend and bulge. `python -m benchmarks.stages` runs the
+real command on them, with one BLAS thread, and writes this page from `runs/growth.json`. Measured on {day}.
 """
 
 
 PEOPLE = """## The number of shapes
 
 How does each stage grow with the number n of shapes? These are shapes of the generator `people`, each body in {poses}
-poses. There are {coarse} coarse vertices and {modes} modes. The last column has the exponent p, if the time grows as n^p
-from the smallest to the largest number. Stages below {shown:.0f} s are left out.
+poses. There are {coarse} coarse vertices and {modes} modes. The last column has the exponent p, if the time grows as
+n^p from the smallest to the largest number. Stages below {shown:.0f} s are left out.
 
 {seconds}
 

@@ -219,7 +219,10 @@ def _alternate(
     """
     shrink = _Shrinkage(problem, D)
     history: list[dict[str, float]] = []
-    for iteration in progress(range(max_iterations + 1), "improving the modes", "round, or fewer", max_iterations + 1):
+    rounds = range(max_iterations + 1)
+    # A trial has so few rounds that only the number of trials is shown.
+    shown = rounds if patience < PATIENCE else progress(rounds, "improving the modes", "round, or fewer", len(rounds))
+    for iteration in shown:
         MD = problem.M @ D.T
         gram, B, norms = D @ MD, D @ problem.MD, problem.one_norms(D)
         misfit = 1 + float(np.vdot(W @ W.T, gram) - 2 * np.vdot(W, B)) / problem.total

@@ -160,6 +160,8 @@ def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     assert set(some) == set(rows) & set(other.split["train"])
     figures = json.loads((run / "evaluation.json").read_text())
     assert figures["derivatives"] == 6
+    # A core computes one file at a time, and all cores have work.
+    assert len(list((run / "samples" / "derivatives").glob("part-*.npz"))) == 6
     assert min(figures["times"][each] for each in ("exact", "exact, with derivatives")) > 0
 
 
