@@ -232,7 +232,7 @@ def _hands(rng: np.random.Generator) -> dict[str, float]:
 
 def _expression(actions: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
     """Draw strengths of actions of the face: most groups contribute one, on both sides or on one."""
-    found = {}
+    found: dict[str, float] = {}
     for group in _FACE:
         action, strength, acts = group[rng.integers(len(group))], rng.uniform(0.3, 1), rng.uniform() < 0.6
         sides = [f"{action}{side}" for side in ("Left", "Right") if f"{action}{side}" in actions] or [action]
