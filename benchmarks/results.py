@@ -90,8 +90,8 @@ def open_run(name: str, data: Path, out: Path) -> Run:
     document["collection"]["mirror"] = name.endswith(MIRRORED)
     if name.endswith(SHELL):
         document["modes"].update(SHELL_MODES)
-        for baselines in ("networks", "evaluation"):
-            document.pop(baselines, None)
+        document.pop("networks", None)
+        document["evaluation"] = {"baselines": True}
     text = tomlkit.dumps(document)
     return Run(out / name, parse(text, name), text, out / "models")
 
@@ -230,9 +230,10 @@ def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
 
 def leading(found: dict[str, Any]) -> str:
     """Return cells of composite, one factor and kernel, with the largest R² in bold."""
-    values = [found["r2"][model]["total"] for model in ("composite", "monolithic", "kernel")]
-    best = r2(max(values))
-    return " | ".join(f"**{best}**" if r2(value) == best else r2(value) for value in values)
+    models = ("composite", "monolithic", "kernel")
+    values = [r2(found["r2"][model]["total"]) if model in found["r2"] else "–" for model in models]
+    best = r2(max(found["r2"][model]["total"] for model in models if model in found["r2"]))
+    return " | ".join(f"**{value}**" if value == best else value for value in values)
 
 
 def joint_exponentials(row: dict[str, Any]) -> list[int]:

@@ -1,7 +1,8 @@
 """docs/measurements/growth.md: processor seconds and memory of every training stage, by the size of the collection.
 
 ``python -m benchmarks.stages`` runs the real command, stage after stage, on capsules that bend and bulge, with one
-size changed at a time. Results are kept under ``--out``.
+size changed at a time. ``--people 50 150`` does the same with as many shapes of the generator `people` instead, which
+needs the extra ``people``. Results are kept under ``--out``, so a repeated command continues.
 """
 
 import argparse
@@ -10,8 +11,10 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -26,6 +29,7 @@ from shapespace.bundle.reader import read_bundle
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Distribution
 from shapespace.model.shape_model import ShapeModel
+from shapespace.training.collection.generators.people import people_meshes
 from shapespace.training.stages.run import STAGES
 
 #: Number of joint exponentials and of exponentials of each factor, which determine the time; codes for each median.
@@ -63,8 +67,21 @@ Memory stays below 1 GB up to 40,000 vertices in the files; 500,000 vertices nee
 - **coarse shape**: CPU time that the finished model takes for a shape on the coarse mesh.
 - **fine mesh**: further time to carry the fine mesh along. Both are medians over {codes} codes.
 
-The collections are capsules that bend and bulge. `python -m benchmarks.stages` runs the real command on them, with one
-BLAS thread, and writes this page from `runs/growth.json`. Measured on {day}.
+{people}The collections of the first two tables are capsules that bend and bulge. `python -m benchmarks.stages` runs the
+real command on them, with one BLAS thread, and writes this page from `runs/growth.json`. Measured on {day}.
+"""
+
+
+PEOPLE = """## The number of shapes
+
+How does each stage grow with the number n of shapes? These are shapes of the generator `people`, each body in {poses}
+poses. There are {coarse} coarse vertices and {modes} modes. The last column has the exponent p, if the time grows as
+n^p from the smallest to the largest number. Stages below {shown:.0f} s are left out.
+
+{seconds}
+
+The largest process takes {memory}. `python -m benchmarks.stages --people` measures this.
+
 """
 
 
@@ -85,6 +102,8 @@ class Size:
 
 
 BASE = Size()
+#: Poses of each body where the number of people grows, and the fewest seconds whose growth means anything.
+PEOPLE_POSES, SHOWN = 5, 5.0
 SIZES = [
     BASE,
     *(replace(BASE, fine=fine) for fine in (40_000, 160_000)),
@@ -130,12 +149,23 @@ licence = "MIT"
 """
 
 
-def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
-    """Return for each stage processor seconds, including workers, and MB of the largest process."""
+def people(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return vertices (n, V, 3) and faces of bodies of people in a few poses."""
+    meshes = people_meshes(-(-count // PEOPLE_POSES), PEOPLE_POSES)
+    return meshes.vertices[:count].astype(np.float32), np.asarray(meshes.faces, np.int32)
+
+
+def measure(
+    size: Size, folder: Path, shapes: Callable[[], tuple[FloatArray, FloatArray]]
+) -> dict[str, tuple[float, float]]:
+    """Return for each stage processor seconds, including workers, and MB of the largest process. Stages that an earlier
+    call has measured are not measured again.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    data, file = folder / "data.npz", folder / "config.toml"
-    vertices, faces = collection(size)
-    np.savez(data, vertices=vertices, faces=faces)
+    data, file, kept = folder / "data.npz", folder / "config.toml", folder / "stages.json"
+    if not data.exists():
+        vertices, faces = shapes()
+        np.savez(data, vertices=vertices, faces=faces)
     file.write_text(config(size, data), encoding="utf-8")
 
     def until(stage: str) -> tuple[float, float]:
@@ -150,7 +180,11 @@ def measure(size: Size, folder: Path) -> dict[str, tuple[float, float]]:
             raise RuntimeError(f"{stage} of {size} ended with {os.waitstatus_to_exitcode(status)}")
         return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
-    found = {stage: until(stage) for stage in STAGES}
+    found: dict[str, tuple[float, float]] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
+    for stage in STAGES:
+        if stage not in found:
+            found[stage] = until(stage)
+            kept.write_text(json.dumps(found), encoding="utf-8")
     # A call with nothing to do takes the time of starting and of reading the files.
     start = until("ingest")[0]
     data.unlink()
@@ -181,6 +215,7 @@ def write_page() -> None:
         memory.append([title, f"{sum(spent.values()):.0f}", f"{megabytes['most']:.0f} MB"])
         memory[-1] += [f"{times[each]:.1f} ms" for each in ("shape", "fine mesh")]
     page = PAGE.format(
+        people=people_section(found["people"]) if found.get("people") else "",
         base=BASE,
         joint=JOINT,
         factors=OF_FACTORS,
@@ -192,18 +227,57 @@ def write_page() -> None:
     pages.write("growth", page)
 
 
+def stage_figures(size: Size, folder: Path) -> dict[str, Any]:
+    """Measure the stages with a number of people, and return the figures."""
+    found = measure(size, folder, partial(people, size.shapes))
+    return {
+        "size": asdict(size),
+        "seconds": {stage: seconds for stage, (seconds, _) in found.items()},
+        "megabytes": {"most": max(megabytes for _, megabytes in found.values())},
+    }
+
+
+def people_section(rows: list[dict[str, Any]]) -> str:
+    """Return the section about the number of shapes."""
+    stages = [stage for stage in rows[0]["seconds"] if rows[-1]["seconds"][stage] > SHOWN]
+    columns = [str(row["size"]["shapes"]) for row in rows]
+    lines = [[f"`{stage}`", *(f"{row['seconds'][stage]:.0f} s" for row in rows)] for stage in stages]
+    first, last = rows[0], rows[-1]
+    for line, stage in zip(lines, stages, strict=True):
+        growth = np.log(last["seconds"][stage] / max(first["seconds"][stage], 0.1))
+        line.append(f"{growth / np.log(last['size']['shapes'] / first['size']['shapes']):.2f}")
+    memory = ", ".join(f"{row['megabytes']['most']:.0f} MB with {row['size']['shapes']} shapes" for row in rows)
+    size = Size(**first["size"])
+    return PEOPLE.format(
+        poses=PEOPLE_POSES,
+        coarse=size.coarse,
+        modes=size.modes,
+        shown=SHOWN,
+        seconds=table(("", *columns, "exponent"), lines),
+        memory=memory,
+    )
+
+
 def main() -> None:
     """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "stages")
+    parser.add_argument("--people", type=int, nargs="+", default=[], help="numbers of shapes of people to measure")
     parser.add_argument("--page", action="store_true", help="measure nothing, and write the page of what is there")
     given = parser.parse_args()
+    known = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {}
+    if given.people:
+        sizes = [replace(BASE, fine=0, shapes=count) for count in sorted(given.people)]
+        known["people"] = [stage_figures(size, given.out / f"people-{size.shapes}") for size in sizes]
+        pages.write_figures(FIGURES, known)
+        write_page()
+        return
     rows: list[dict[str, Any]] = []
     for size in [] if given.page else SIZES:
         name = "-".join(map(str, asdict(size).values()))
         path = given.out / f"{name}.json"
         if not path.exists():
-            measured = measure(size, given.out / name)
+            measured = measure(size, given.out / name, partial(collection, size))
             with threadpool_limits(1):
                 path.write_text(
                     json.dumps({"stages": measured, "serving": serving(given.out / name)}), encoding="utf-8"
@@ -220,7 +294,7 @@ def main() -> None:
             }
         )
     if rows:
-        pages.write_figures(FIGURES, {"day": f"{datetime.now(UTC):%Y-%m-%d}", "rows": rows})
+        pages.write_figures(FIGURES, known | {"day": f"{datetime.now(UTC):%Y-%m-%d}", "rows": rows})
     write_page()
 
 

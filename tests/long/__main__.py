@@ -63,6 +63,11 @@ TESTS = {
         ("training", "shapespace/shell", "shapespace/solve", "shapespace/coordinates", "shapespace/model"),
         ("python -m tests.folders",),
     ),
+    "people": LongTest(
+        "make the bodies of the generators expressive and people with the package anny, and check how they move",
+        ("training/collection/generators",),
+        ("python -m pip install anny>=0.6.2,<0.7", f"{WHOLE} tests/long/test_people.py"),
+    ),
     "faults": LongTest(
         "inflict every fault SEEDS times: kills, full disks, damaged files, slow clients and more",
         ("service", "training", "shapespace/bundle"),

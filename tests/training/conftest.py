@@ -60,6 +60,7 @@ hidden = [16]
 fit = { batch_size = 8, max_epochs = 3 }
 
 [evaluation]
+baselines = true
 grid_nodes = 4
 reconstructions = 2
 

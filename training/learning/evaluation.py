@@ -60,7 +60,7 @@ def reconstruct(
     diagonal; ``mean`` and ``max`` distance, mean Gauss–Newton ``iterations``, and the count of each ``status``.
     """
     reconstructor = Reconstructor(reference, eta)
-    shapes = progress(predicted, "reconstructed shapes", "shape", len(predicted))
+    shapes = progress(predicted, "turning predictions into shapes", "shape", len(predicted))
     found = [reconstructor(z, tolerance=1e-6) for z in shapes]
     vertices = align(np.array([f.vertices for f in found]), exact)
     errors = np.linalg.norm(vertices - exact, axis=2) / reference.diagonal
@@ -113,12 +113,10 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
     test, composite = HeldOutSamples.of(learner), learner.main()
     if learner.straight:
         return _evaluate_straight(learner, test, composite)
-    models: dict[str, Composite | nn.Module] = {
-        "composite": composite,
-        "monolithic": learner.monolithic(),
-        "monolithic_paper": learner.monolithic_paper(),
-        "kernel": learner.kernel(),
-    }
+    models: dict[str, Composite | nn.Module] = {"composite": composite}
+    if settings.baselines:
+        models |= {"monolithic": learner.monolithic(), "monolithic_paper": learner.monolithic_paper()}
+    models["kernel"] = learner.kernel()
     if config.networks.paper:
         models["paper"] = learner.paper()
     shapes, found = exact_factors(learner, test.rows[: settings.exact_factors], exact)
@@ -129,7 +127,7 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
         "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
     sizes = {name: size_bytes(model) for name, model in models.items()}
-    if grids := factor_grids(collection, settings, exact):
+    if settings.baselines and (grids := factor_grids(collection, settings, exact)):
         interpolated = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
         # A node without a shape leaves NaN around it.
         if np.isfinite(interpolated).all():

@@ -15,6 +15,7 @@ from torch.optim import Adam, Muon, Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.files.atomic import replaced_file
+from shapespace.training.learning.allocator import memory_kept
 from shapespace.training.learning.networks import ShapeNetwork, predict
 from shapespace.training.runs.atomic_files import reading
 from shapespace.training.runs.network_settings import FitSettings
@@ -61,6 +62,7 @@ def read_network(path: Path) -> SavedNetwork:
     return SavedNetwork(json.loads(metadata.pop("state")), metadata, own, tensors)
 
 
+@memory_kept()
 def fit(
     network: ShapeNetwork,
     inputs: Tensor,

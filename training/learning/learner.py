@@ -118,9 +118,16 @@ class Learner:
             torch.from_numpy(data.rows["validation"]),
             fitting.model_copy(update={"max_epochs": round(fitting.max_epochs / share)}),
             path,
-            title=path.stem.rpartition("-")[0],
+            title=self._words(path),
             seed=self.seed,
         )
+
+    def _words(self, path: Path) -> str:
+        """Say for the progress what the network in a file learns."""
+        kind, _, number = path.stem.rpartition("-")[0].partition("-")
+        if kind == "factor":
+            return f"learning factor {list(self.collection.factors)[int(number)]!r}"
+        return "learning how factors join" if kind == "combiner" else "learning a network to compare with"
 
     def _record(self, path: Path, state: dict[str, Any]) -> None:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}

@@ -40,11 +40,11 @@ class Config(SettingsTable):
     samples: SampleSettings = SampleSettings()
     networks: NetworkSettings = NetworkSettings()
     monolithic: LatentNetworkSettings = LatentNetworkSettings(hidden=[256, 256])
-    """The network with one factor for the whole code, trained for comparison."""
+    """The network with one factor for the whole code, trained for comparison if ``evaluation.baselines``."""
     monolithic_paper: LatentNetworkSettings = LatentNetworkSettings(
         hidden=[256, 256], fourier=0, skip_degree=0, energy=1, fit=FitSettings()
     )
-    """The paper's network with one factor, trained for comparison."""
+    """The paper's network with one factor, trained for comparison if ``evaluation.baselines``."""
     variants: dict[str, dict[str, Any]] = Field({})
     """Not used any more. Version 0.2 trained rows of an ablation; ``python -m benchmarks.studies`` does so now."""
     evaluation: EvaluationSettings = EvaluationSettings()

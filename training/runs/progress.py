@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -12,6 +12,19 @@ from tqdm import tqdm
 DELAY = 5
 #: Seconds between two outputs where there is no terminal.
 PAUSE = 10
+
+#: Typical share of each stage in the time of a run, in percent. Larger runs spend more of it on samples.
+SHARES = {
+    "ingest": 10,
+    "mean": 6,
+    "modes": 14,
+    "factors": 0,
+    "samples": 42,
+    "networks": 15,
+    "generalisation": 7,
+    "evaluation": 5,
+    "export": 1,
+}
 
 Item = TypeVar("Item")
 
@@ -54,3 +67,22 @@ def waiting(title: str) -> Iterator[None]:
     finally:
         over.set()
         clock.join()
+
+
+def stage_place(name: str, seconds: Mapping[str, float], stages: Iterable[str]) -> str:
+    """Say which of the ``stages`` this one is, and about how long it and the later stages will take.
+
+    The estimate comes from the ``seconds`` of the stages that are done and from `SHARES`. It is left out before any
+    stage has taken a second.
+    """
+    names = list(stages)
+    k = names.index(name)
+    words = f"stage {k + 1} of {len(names)}"
+    done = sum(SHARES[each] for each in names[:k] if each in seconds)
+    taken = sum(seconds[each] for each in names[:k] if each in seconds)
+    if not done or taken < 1:
+        return words
+    left = taken / done * sum(SHARES[each] for each in names[k:]) / 60
+    if left < 1:
+        return f"{words}, less than a minute left"
+    return f"{words}, about {left:.0f} min left" if left < 90 else f"{words}, about {left / 60:.0f} h left"

@@ -30,8 +30,10 @@ class SettingsTable(BaseModel):
 class CollectionSettings(SettingsTable):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
-    generator: Literal["freaky-torus", "figure"] | None = None
-    """Name of a built-in generator, which makes the shapes itself."""
+    generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
+    """Name of a built-in generator, which makes the shapes itself. ``expressive`` is a body in 149 poses: 100 with
+    moving hands and face, 49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need the extra
+    ``people``."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
     one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
@@ -146,7 +148,8 @@ class SampleSettings(SettingsTable):
     as about ten samples without. Beside a few hundred samples, it is worth more than ten others. By default 60, but at
     most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
-    """Number of samples per file. A worker computes one file at a time, and loses it if it dies."""
+    """Number of samples per file, and of derivatives a tenth of it. A worker computes one file at a time, and loses it
+    if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
     """Share of the joint samples that are used for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
@@ -176,9 +179,12 @@ class EvaluationSettings(SettingsTable):
 
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
+    baselines: bool = False
+    """Whether networks with one factor are trained too, for comparison: ``monolithic`` and ``monolithic_paper``. This
+    about doubles the time of the stage ``networks``."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
     """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020, for comparison. It may take as long as
-    all samples. 0 leaves it out."""
+    all samples. 0 leaves it out. Needs ``baselines``."""
     grid_size: int = Field(1000, ge=1)
     """Most nodes of the grid of one factor. A factor gets no grid if this leaves fewer than 3 nodes per coordinate."""
     exact_factors: int = Field(200, ge=2)

@@ -71,7 +71,7 @@ def nearest_codes(
 
 def gathered(results: Iterable[tuple[int, NearestCode]], count: int) -> Codes:
     """Return the codes of ``count`` searches that end in any order."""
-    found = dict(progress(results, "codes", "shape", count))
+    found = dict(progress(results, "finding the codes of your shapes", "shape", count))
     codes, vertices, counts, status = zip(*(found[k] for k in range(count)), strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
 

@@ -106,7 +106,8 @@ class _Search:
         work = [[(self._shapes[i], *more) for i, more in part] for part in parts]
         news = False
         results = run(partial(_each, function, self._space, self._mean), work, workers=self._workers)
-        for k, found in progress(results, "logarithms", f"{chunk} shapes" if chunk > 1 else "shape", len(parts)):
+        unit = f"{chunk} shapes" if chunk > 1 else "shape"
+        for k, found in progress(results, "finding paths from the mean to your shapes", unit, len(parts)):
             for (i, _), (connected, status, reason) in zip(parts[k], found, strict=True):
                 self._status[i], self._reasons[i] = status, self._reasons[i] or reason
                 if connected is not None:

@@ -30,7 +30,7 @@ def centred_mean(
     The reference gives connectivity, shapes (n, V, 3) may be in any position, and ``steps`` is K of the logarithms.
     Returns the mean with the status of the elastic mean; without an exponential it is the elastic mean itself.
     """
-    with waiting("elastic mean"):
+    with waiting("finding the mean shape"):
         found = elastic_mean(ShellSpace(reference, material), shapes)
     if found.status is not Status.CONVERGED:
         return found

@@ -12,6 +12,8 @@ after the other is solved, and the objective never rises.
   metric, scaled to weigh as much as M on the logarithms. Then z is a soft threshold. The matrix is factorised once: it
   is the same for all modes and iterations, because the penalty G is scaled with |w_j|² like the other terms. A few
   iterations are enough, because z and its multiplier are kept.
+- Modes that hardly overlap are solved together, which takes half the time. If their sum raises the objective, they all
+  go a part of the way. The objective is convex in all modes, so at 1/k of the way of k modes it does not rise.
 - W is least squares in a box, a small problem for each shape, solved by coordinate descent.
 
 The iteration starts from the modes of the plain analysis, rotated to be as concentrated as possible (varimax). At λ = 0
@@ -20,7 +22,9 @@ start from the modes without rotation.
 
 The right sparsity depends on the shapes. The modes cannot reproduce on held-out shapes what only one shape has, so a
 certain sparsity costs nothing. By default λ is the largest value that raises the square error of held-out shapes by at
-most 3 %. Principal modes in inner folds estimate this error.
+most 3 %. Principal modes in inner folds estimate this error. The search begins at the largest λ and starts each λ from
+the modes of the one before. At most λ a few rounds tell that the error is far too large. Only the last ones are solved
+to the end.
 
 What a sparsity costs in each norm is in benchmarks/NOTES.md.
 """
@@ -36,11 +40,14 @@ from shapespace.coordinates.normal_matrix import NormalMatrix, QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import analyse
+from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.modes import ModeProblem, Modes, Norm, localisation, pga, validation_norm
 
-#: ADMM iterations on a mode before the next mode, and their over-relaxation, between 1 and 2.
-ADMM_ITERATIONS, OVERRELAXATION = 10, 1.6
+#: ADMM iterations on modes before the next modes, and their over-relaxation, between 1 and 2.
+ADMM_ITERATIONS, OVERRELAXATION = 5, 1.6
+#: Most modes that are solved together, and the greatest sum of their couplings with one more, see `_groups`.
+TOGETHER, COUPLED = 10, 0.3
 #: Most rounds of the rotation at the start, and of coordinate descent on the coefficients.
 VARIMAX_ROUNDS, SWEEPS = 200, 100
 #: The iteration ends when the objective falls by less than this part of itself in `PATIENCE` rounds. The part is larger
@@ -48,6 +55,9 @@ VARIMAX_ROUNDS, SWEEPS = 200, 100
 #: modes have stopped changing.
 TOLERANCE: dict[Norm, float] = {"mixed": 5e-3, "vertices": 5e-3, "shell": 1e-3}
 PATIENCE = 10
+#: The same where a sparsity is only tried: the part, and the rounds. The rounds after these win back less than the last
+#: share of the objective.
+TRIAL_TOLERANCE, TRIAL_PATIENCE, TRIAL_GAIN = 2e-2, 5, 0.1
 #: The sparsity is the first of these whose modes raise the square error of held-out logarithms by at most this share of
 #: the error of principal modes.
 SPARSITIES = (0.128, 0.064, 0.032, 0.016, 0.008, 0.004, 0.002, 0.001, 0.0005)
@@ -109,8 +119,14 @@ def spga(
     enough = _sparsity_criterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
     rotation = _varimax(problem.scaled(D))
     D, W = _normalised(rotation.T @ D, rotation.T @ W)
-    for share in SPARSITIES if sparsity is None else [sparsity]:
-        converged, history = _alternate(problem, D, W, share * highest, max_iterations, tolerance)
+    shares = SPARSITIES if sparsity is None else [sparsity]
+    for share in progress(shares, "finding modes that move one part each", "sparsity", len(shares)):
+        price = share * highest
+        if enough and share != SPARSITIES[-1]:
+            tried = _alternate(problem, D, W, price, max_iterations, TRIAL_TOLERANCE, TRIAL_PATIENCE)[1]
+            if not enough(D, TRIAL_GAIN * tried[-1]["objective"]):
+                continue
+        converged, history = _alternate(problem, D, W, price, max_iterations, tolerance)
         if enough and enough(D):
             break
     return replace(problem.modes(D, converged, history), sparsity=share)
@@ -149,12 +165,14 @@ class _SparseProblem(ModeProblem):
 
 def _sparsity_criterion(
     space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm, original_index: IntArray | None
-) -> Callable[[FloatArray], bool]:
-    """Whether modes (m, 3V) keep enough of the logarithms, compared with principal modes D; see `SPARSITIES`."""
+) -> Callable[..., bool]:
+    """Return a function that says whether modes (m, 3V) keep enough of the logarithms, compared with principal modes D,
+    see `SPARSITIES`. Its second argument is a share of the logarithms that they may lack.
+    """
     problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
     left = problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
     least = problem.project(D)[1] - ALLOWED_ERROR * float(left) / problem.total
-    return lambda modes: problem.project(modes)[1] >= least
+    return lambda modes, lacking=0.0: problem.project(modes)[1] >= least - lacking
 
 
 class _Shrinkage:
@@ -174,27 +192,37 @@ class _Shrinkage:
         self._z = (self._J @ D.T).T
         self._y = np.zeros_like(self._z)
 
-    def __call__(self, j: int, target: FloatArray, price: float) -> FloatArray:
-        """Improve mode j (3V,) towards a target."""
-        z, y, threshold = self._z[j], self._y[j], price * self._threshold
-        pull = self._M @ target
+    def __call__(self, some: IntArray, targets: FloatArray, prices: FloatArray) -> FloatArray:
+        """Improve some modes (k,) towards targets (k, 3V), at their prices (k,)."""
+        z, y, threshold = self._z[some].T, self._y[some].T, prices * self._threshold[:, None]
+        pull = self._M @ targets.T
         for _ in range(ADMM_ITERATIONS):
-            d = self._factor.solve(pull + self._JtG @ (z - y))
-            y += OVERRELAXATION * (self._J @ d) + (1 - OVERRELAXATION) * z
-            z[:] = np.sign(y) * np.maximum(np.abs(y) - threshold, 0)
-            y -= z
+            d = self._factor.solve((pull + self._JtG @ (z - y)).T)
+            y = OVERRELAXATION * (self._J @ d.T) + (1 - OVERRELAXATION) * z + y
+            left = np.clip(y, -threshold, threshold)
+            z, y = y - left, left
+        self._z[some], self._y[some] = z.T, y.T
         return d
 
 
 def _alternate(
-    problem: _SparseProblem, D: FloatArray, W: FloatArray, price: float, max_iterations: int, tolerance: float
+    problem: _SparseProblem,
+    D: FloatArray,
+    W: FloatArray,
+    price: float,
+    max_iterations: int,
+    tolerance: float,
+    patience: int = PATIENCE,
 ) -> tuple[bool, list[dict[str, float]]]:
     """Minimise in place over modes D (m, 3V) and coefficients W (m, n), block by block, never uphill. Returns whether
     the iteration converged, and its history, see `Modes`.
     """
     shrink = _Shrinkage(problem, D)
     history: list[dict[str, float]] = []
-    for iteration in range(max_iterations + 1):
+    rounds = range(max_iterations + 1)
+    # A trial has so few rounds that only the number of trials is shown.
+    shown = rounds if patience < PATIENCE else progress(rounds, "improving the modes", "round, or fewer", len(rounds))
+    for iteration in shown:
         MD = problem.M @ D.T
         gram, B, norms = D @ MD, D @ problem.MD, problem.one_norms(D)
         misfit = 1 + float(np.vdot(W @ W.T, gram) - 2 * np.vdot(W, B)) / problem.total
@@ -209,28 +237,71 @@ def _alternate(
                 "support": float(support.mean()),
             }
         )
-        if iteration >= PATIENCE:
-            then, now = history[-1 - PATIENCE]["objective"], history[-1]["objective"]
+        if iteration >= patience:
+            then, now = history[-1 - patience]["objective"], history[-1]["objective"]
             if then - now <= tolerance * now:
                 return True, history
         _fit_in_box(gram, B, W)
-        for j, w in enumerate(W):
-            square = float(w @ w)
-            if square == 0:
-                continue
-            others = W @ w
-            others[j] = 0
-            target = (w @ problem.D - others @ D) / square
-            lowered = problem.M @ target
-
-            def worth(d: FloatArray) -> float:
-                """Return the objective with this field as mode j, less the objective without mode j."""
-                fit = d @ (problem.M @ d) - 2 * d @ lowered  # noqa: B023 - used before the next round
-                return float(square * fit + price * problem.one_norms(d[None])[0])  # noqa: B023
-
-            # A few ADMM iterations may raise the objective, and a weak mode may cost more than it is worth.
-            D[j] = min((shrink(j, target, price / square), D[j].copy(), np.zeros_like(target)), key=worth)
+        for some in _groups(gram, W):
+            _improve(problem, shrink, D, W, some, price)
     return False, history
+
+
+def _groups(gram: FloatArray, W: FloatArray) -> list[IntArray]:
+    """Divide the modes into groups that are solved together, each of modes that are hardly coupled.
+
+    The coupling of two modes is the cosine of their coefficients times the cosine of their fields, without signs; the
+    ``gram`` matrix (m, m) has the inner products of the fields. Modes without coefficients are left out.
+    """
+    others, squares = W @ W.T, gram.diagonal()
+    sizes = np.outer(others.diagonal(), np.maximum(squares, 1e-300))
+    coupling = np.abs(others * gram) / np.sqrt(np.maximum(sizes * sizes.T, 1e-300))
+    left, groups = np.flatnonzero(others.diagonal()).tolist(), []
+    while left:
+        group = [left.pop(0)]
+        while left and len(group) < TOGETHER:
+            with_group = coupling[np.ix_(left, group)].sum(axis=1)
+            nearest = int(with_group.argmin())
+            if with_group[nearest] > COUPLED:
+                break
+            group.append(left.pop(nearest))
+        groups.append(np.array(group))
+    return groups
+
+
+def _improve(
+    problem: _SparseProblem, shrink: _Shrinkage, D: FloatArray, W: FloatArray, some: IntArray, price: float
+) -> None:
+    """Improve some modes (k,) of D (m, 3V) in place, so that the objective does not rise."""
+    inner = W[some] @ W.T
+    squares = inner[np.arange(len(some)), some]
+    others = inner.copy()
+    others[np.arange(len(some)), some] = 0
+    targets = (W[some] @ problem.D - others @ D) / squares[:, None]
+    before, lowered = D[some], problem.M @ targets.T
+
+    def worth(d: FloatArray) -> FloatArray:
+        """Return the objective with each of these fields (k, 3V) as its mode, less the objective without the mode."""
+        fit = np.einsum("jx,xj->j", d, problem.M @ d.T - 2 * lowered)
+        return squares * fit + price * problem.one_norms(d)
+
+    # A few ADMM iterations may raise the objective, and a weak mode may cost more than it is worth.
+    tried = np.stack([shrink(some, targets, price / squares), before, np.zeros_like(before)])
+    step = tried[np.argmin([worth(d) for d in tried], axis=0), np.arange(len(some))] - before
+    if len(some) > 1:
+        moved = problem.M @ step.T
+        curved = float(np.vdot(inner[:, some] @ step, moved.T))
+        slope = 2 * float(np.vdot(inner @ D - W[some] @ problem.D, moved.T))
+        least, share = float(problem.one_norms(before).sum()), 1.0
+
+        def rises(share: float) -> bool:
+            penalty = float(problem.one_norms(before + share * step).sum()) - least
+            return share**2 * curved + share * slope + price * penalty > 0
+
+        while share * len(some) > 1 and rises(share):
+            share /= 2
+        step *= share
+    D[some] = before + step
 
 
 def _fit_in_box(gram: FloatArray, B: FloatArray, W: FloatArray) -> None:

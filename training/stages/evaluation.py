@@ -23,7 +23,7 @@ def measure_run(run: Run) -> None:
 
     def exact(name: str, latents: FloatArray, collection: Collection | None = None) -> Exact:
         folder = directory.exact / name
-        run.draw(folder, latents, f"exact shapes, {name}", shorten=False, collection=collection)
+        run.draw(folder, latents, f"exact shapes, {name}", shorten=False, collection=collection, few=True)
         samples = read(folder)
 
         def each(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -83,7 +83,11 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="evaluation",
     version=2,
-    settings=lambda config: [config.evaluation, config.export.model_dump(include={"eta_reconstruction"})],
+    # Without baselines, the digest is the same as in version 0.2, and the stage is not done again.
+    settings=lambda config: [
+        config.evaluation.model_dump(mode="json", exclude=None if config.evaluation.baselines else {"baselines"}),
+        config.export.model_dump(include={"eta_reconstruction"}),
+    ],
     run=measure_run,
     results=lambda run: [run.evaluation.path, run.gallery.path, run.report.path, run.exact],
     warnings=_warnings,

@@ -54,7 +54,7 @@ def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
         shapes = nric(directory.shapes.read()["vertices"], directory.reference_mesh().connectivity)
         combiner = ExampleCorrectedCombiner.of(composite, directory.training_codes(), shapes)
         composite = replace(composite, combiner=combiner)
-    with waiting("bundle"):
+    with waiting("writing the bundle"):
         return export(
             composite, run.collection, run.config, figures, digest.hexdigest(), run.models, geometry, learner.start()
         )
@@ -100,7 +100,10 @@ def _encode_collection(run: Run, bundle: Path) -> None:
     if fine is not None:
         mesh = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
         given, index = fine, reference["fine_index"]
-    found = [model.encode(scale * shape) for shape in progress(given, "codes of the shapes", "shape", len(given))]
+    found = [
+        model.encode(scale * shape)
+        for shape in progress(given, "finding the codes of your shapes", "shape", len(given))
+    ]
     near = np.stack([each.shape.vertices for each in found]) / scale
     linear = PrincipalComponents.of(given, mesh.vertices).nearest(given, model.latents.dimension)
     away, other = (vertex_distances(each, given, mesh.diagonal) for each in (near, linear))

@@ -117,7 +117,7 @@ def _coarse_mesh(
     shell = submesh(fine, own) if meshes.parts else fine
     if not 0 < NEARLY_COARSE * settings.coarse_vertices < len(own):
         return shell, own, {}
-    with waiting("coarse mesh"):
+    with waiting("simplifying the mesh"):
         every = some_vertices(vertices, own)
         if len(images):
             every = stacked(len(vertices) + len(images), (x[own] for x in itertools.chain(vertices, images)))

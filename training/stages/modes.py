@@ -7,7 +7,6 @@ import numpy as np
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.progress import waiting
 from shapespace.training.space.codes import box_of, enough_steps, nearest_codes
 from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
@@ -34,8 +33,7 @@ def decompose(run: Run) -> None:
     found = logarithms(space, centre.vertices, shapes, steps)
     count = mode_count(settings, space, centre.vertices, found.fields, original_index)
     dense = pga(space, centre.vertices, found.fields, count, settings.norm)
-    with waiting("sparse modes"):
-        sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
+    sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
     shooting = steps
     if settings.log_steps == "auto" and space.first_step == "centred" and steps > 1:
         shooting = enough_steps(space, centre.vertices, sparse.vertices, sparse.coefficients)

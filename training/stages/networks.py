@@ -43,8 +43,9 @@ def train_networks(run: Run) -> None:
             )
     learner = learner_of(run)
     learner.main()
-    learner.monolithic()
-    learner.monolithic_paper()
+    if run.config.evaluation.baselines:
+        learner.monolithic()
+        learner.monolithic_paper()
     if run.config.networks.paper:
         learner.paper()
     directory.histories.write(learner.histories)
@@ -54,10 +55,15 @@ def train_networks(run: Run) -> None:
 
 
 def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
-    """Return the settings in the key. Version 0.2 also trained the variants, and its runs have to keep their keys."""
+    """Return the settings in the key. Version 0.2 also trained the variants, and its runs have to keep their keys.
+
+    Version 0.2 always trained the baselines. Its runs need not be done again without them.
+    """
     row: dict[str, Any] = {"title": "", "base": None, "factors": {}, "combiner": {}}
     variants = config.model_dump(mode="json")["variants"].values()
-    return [config.networks, config.monolithic, config.monolithic_paper, *(row | variant for variant in variants)]
+    asked = [{"baselines": True}] if config.evaluation.baselines else []
+    rows = (row | variant for variant in variants)
+    return [config.networks, config.monolithic, config.monolithic_paper, *rows, *asked]
 
 
 # A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks

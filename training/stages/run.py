@@ -13,6 +13,7 @@ from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import NotARunError, RunDirectory
+from shapespace.training.runs.progress import stage_place
 from shapespace.training.stages import (  # fmt: skip
     STAGE_NAMES,
     evaluation,
@@ -206,7 +207,9 @@ def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], sho
     before = directory.spent(name, keys["key"])
     directory.stamp(name).write(begun)
     directory.log("begin", stage=name, key=keys["key"])
-    show(f"{name} …")
+    stages = [each for each, other in STAGES.items() if not (run.by_design and other.meshes_only)]
+    place = f" {stage_place(name, _seconds(directory), stages)}" if name in stages else ""
+    show(f"{name} …{place}")
     start = time.monotonic()
     if stage.meshes_only and run.by_design:
         directory.log("skipped", why="the generator gives factors and bounds itself")
@@ -220,6 +223,12 @@ def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], sho
     directory.stamp(name).write(begun | {"seconds": seconds, "files": written(stage, directory)})
     directory.log("end", stage=name, seconds=round(seconds, 3))
     show(f"{name}: {seconds:.0f} s")
+
+
+def _seconds(directory: RunDirectory) -> dict[str, float]:
+    """Return the seconds of each stage that is done."""
+    stamps = {name: directory.stamp(name).read_if_written() for name in STAGES}
+    return {name: stamp["seconds"] for name, stamp in stamps.items() if "seconds" in stamp}
 
 
 def _data_facts(run: Run) -> dict[str, dict[str, Any]]:

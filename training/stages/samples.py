@@ -48,7 +48,7 @@ def draw_samples(run: Run) -> None:
     directory.split.write(**rows)
     differentiated, chosen = run.collection.differentiated, rows["train"][: settings.differentiated]
     if differentiated and len(chosen):
-        run.draw(folder / DERIVATIVES, codes[chosen], "derivatives", shorten=False, collection=differentiated)
+        run.draw(folder / DERIVATIVES, codes[chosen], "derivatives", shorten=False, collection=differentiated, few=True)
     else:
         shutil.rmtree(folder / DERIVATIVES, ignore_errors=True)
 

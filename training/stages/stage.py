@@ -24,6 +24,8 @@ from shapespace.training.space.straight_lines import StraightLines
 
 #: A stage stops the run if it loses a larger share of its logarithms or samples.
 TOLERATED_LOSS = 0.25
+#: A file has this part of the usual number of samples where there are few of them, or each takes long.
+SMALLER = 10
 #: Most names in a sentence.
 LISTED_NAMES = 6
 #: What helps where logarithms or samples fail.
@@ -120,14 +122,24 @@ class Run:
         return self.models / self.config.export.name / str(self.config.export.version)
 
     def draw(
-        self, folder: Path, latents: FloatArray, title: str, *, shorten: bool, collection: Collection | None = None
+        self,
+        folder: Path,
+        latents: FloatArray,
+        title: str,
+        *,
+        shorten: bool,
+        collection: Collection | None = None,
+        few: bool = False,
     ) -> None:
-        """Compute samples of codes (n, m) into a folder, and log the progress; see sampling.draw."""
+        """Compute samples of codes (n, m) into a folder, and log the progress; see sampling.draw. Where they are few,
+        files are smaller, so that all cores have work.
+        """
+        size = self.config.samples.part_size
         parts = draw(
             collection or self.collection,
             folder,
             latents,
-            self.config.samples.part_size,
+            max(1, size // SMALLER) if few else size,
             title,
             shorten=shorten,
             scheduler=self.scheduler,

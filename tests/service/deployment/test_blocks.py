@@ -37,6 +37,9 @@ UNTRIED = {
     ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
         "needs a container engine; `make long image-test` builds and tries the same"
     ),
+    ("docs/how-to/collections.md", "pip install 'shapespace[train,people]'"): (
+        "installs 500 MB and trains for more than an hour; `make long people` makes the same bodies"
+    ),
     ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the block above it sends the same request",
 }
 

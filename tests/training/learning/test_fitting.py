@@ -1,6 +1,7 @@
 """The training loop: it learns, and after a kill it continues to the same result."""
 
 import itertools
+import resource
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import trimesh
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning import fitting
+from shapespace.training.learning.allocator import memory_kept
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import FactorNetwork
 from shapespace.training.runs.latent_coordinates import Coordinates
@@ -119,3 +121,19 @@ def test_a_fit_has_as_many_epochs_as_fit_into_its_time(
     asked = FitSettings(max_epochs=10, batch_size=16, schedule="cosine")
     for key, value in fit(data, tmp_path / "asked.safetensors", asked).state_dict().items():
         assert torch.equal(value, short[key]), key
+
+
+def test_freed_memory_is_kept_from_step_to_step() -> None:
+    """The system maps no new pages for an array as large as one that was freed, and gets the memory back at the end."""
+
+    def mapped_anew() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(5):
+            np.ones(8_000_000)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    usual = mapped_anew()
+    with memory_kept():
+        np.ones(8_000_000)
+        assert mapped_anew() < usual / 4
+    assert mapped_anew() > usual / 2

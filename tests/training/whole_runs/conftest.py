@@ -22,7 +22,7 @@ CONFIG = small_config(
     part_size=10,
     epochs=8,
     correction='kind = "kernel", coefficients = 4',
-    evaluation="grid_nodes = 5\ngrid_size = 30\nreconstructions = 4",
+    evaluation="baselines = true\ngrid_nodes = 5\ngrid_size = 30\nreconstructions = 4",
 )
 SPHERE, SURFACE = with_parts(ball())
 EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, SURFACE.sizes)]) for k in range(3))

@@ -160,6 +160,8 @@ def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     assert set(some) == set(rows) & set(other.split["train"])
     figures = json.loads((run / "evaluation.json").read_text())
     assert figures["derivatives"] == 6
+    # A core computes one file at a time, and all cores have work.
+    assert len(list((run / "samples" / "derivatives").glob("part-*.npz"))) == 6
     assert min(figures["times"][each] for each in ("exact", "exact, with derivatives")) > 0
 
 
@@ -423,6 +425,18 @@ def test_more_samples_are_drawn_beside_those_that_are_there(copy: Run, monkeypat
     copy.source = copy.source.replace("steps = 4\npart", "steps = 2\npart")
     again(copy, monkeypatch, "\ncount = 60", "\ncount = 10", "samples")
     assert all(path.stat().st_mtime_ns != before[path] for path in files if path.exists())
+
+
+def test_without_baselines_nothing_is_trained_for_comparison(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    again(copy, monkeypatch, "baselines = true\n", "", "evaluation")
+    kinds = {path.stem.rpartition("-")[0] for path in copy.directory.networks()}
+    assert (
+        kinds == {"combiner", "factor-0", "factor-1"} == {k.rpartition("-")[0] for k in copy.directory.histories.read()}
+    )
+    found = copy.directory.evaluation.read()
+    assert found["r2"].keys() == {"composite", "kernel", "affine", "affine of learned factors"}
+    assert found["fresh"]["r2"].keys() == {"composite", "kernel"}
+    assert copy.directory.report.exists()
 
 
 def test_networks_that_are_not_needed_any_more_are_removed(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from shapespace.training.collection.generators import figure
 from shapespace.training.collection.generators.freaky_torus import FreakyTorus
+from shapespace.training.collection.generators.people import expressive_meshes, people_meshes
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.sampling import Collection
 
@@ -19,4 +20,8 @@ def figure_meshes() -> MeshCollection:
 #: Products of shape spaces by design: they give factors and bounds themselves, so the run skips `mean` and `modes`.
 PRODUCTS: dict[str, Callable[[], Collection]] = {"freaky-torus": FreakyTorus}
 #: Generators of meshes in correspondence, as a folder holds them.
-MESHES: dict[str, Callable[[], MeshCollection]] = {"figure": figure_meshes}
+MESHES: dict[str, Callable[[], MeshCollection]] = {
+    "figure": figure_meshes,
+    "expressive": expressive_meshes,
+    "people": people_meshes,
+}

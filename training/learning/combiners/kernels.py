@@ -71,14 +71,17 @@ class KernelCorrection(Correction):
         count = max(1, min(settings.patches, len(reference.edges) // LIMITS.edges))
         entries = patch_entries(reference.edge_midpoints, count, seed)
         patches = [Patch(columns, settings.coefficients, pairs[0]) for columns in entries]
-        for patch in progress(patches, "metrics", "patch"):
+        for patch in progress(patches, "comparing how factors join, by parts of the surface", "part", len(patches)):
             patch.learn_metric(pairs, others)
         coordinates = max(patch.rank for patch in patches)
         known = len(pairs[0]) + (coordinates * len(own.slopes.inputs) if own.slopes else 0)
         best: list[Patch] = []
-        for most in sorted({min(most, known) for most in LIMITS.functions}):
+        sizes = sorted({min(most, known) for most in LIMITS.functions})
+        for k, most in enumerate(sizes, 1):
             fitted = [copy(patch) for patch in patches]
-            for patch in progress(fitted, f"kernels, {most} functions", "patch"):
+            for patch in progress(
+                fitted, f"learning how factors join, {k} of at most {len(sizes)}", "part", len(fitted)
+            ):
                 patch.fit(pairs, others, own.slopes, coordinates, most, LIMITS.rank)
             if best and _error(best) - _error(fitted) < LIMITS.unseen:
                 break
