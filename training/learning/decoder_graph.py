@@ -38,9 +38,9 @@ CODES = 150
 #: Number of these codes at which each narrow array is tried.
 TRIED = 12
 #: Largest distance from a draft in diagonals. An export measures less, since other codes and runtimes differ more.
-TOLERANCE, MEASURED = 2e-5, 1e-5
+TOLERANCE, MEASURED = 2e-5, 1.4e-5
 #: Share of this distance that narrow arrays may cause, and the factor by which it falls until the measured one is met.
-NARROWING, FALL = 8e-6, 0.75
+NARROWING, FALL = 1.3e-5, 0.75
 #: Size in bytes up to which a graph may be larger than the rest of its bundle.
 SMALL = 8 * 2**20
 #: Number of coarse vertices above which another limit holds, in bytes.
