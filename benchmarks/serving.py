@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import onnxruntime
 from threadpoolctl import threadpool_limits
 
 from benchmarks import pages, synthetic
@@ -58,6 +59,8 @@ Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu
 medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day}; the
 models may have been trained again since.
 """
+#: Numbers of codes that a graph takes at once.
+BATCHES = (1, 8, 64)
 #: Two results of one code agree up to this fraction of the diagonal.
 AGREEMENT = 1e-4
 
@@ -126,6 +129,7 @@ def away(model: ShapeModel, codes: Codes) -> list[float]:
 def stages(folders: list[Path], count: int) -> None:
     """Print times by stage, for every bundle in some folders."""
     own: list[list[str]] = []
+    batches: list[list[str]] = []
     tails: list[list[str]] = []
     beside: list[list[str]] = []
     exact: list[list[str]] = []
@@ -145,6 +149,8 @@ def stages(folders: list[Path], count: int) -> None:
         others = f"{ms(median['full'])} / {ms(median['draft'])}"
         tails.append([name, p95, p99, others, f"{median['without MKL'] / median['sum']:.2f}"])
         shares = " / ".join(f"{median[key] / median['SuperLU']:.2f}" for key in ("sum", "full", "draft"))
+        if found := graph(model, codes[3:]):
+            batches.append([name, *found])
         furthest = f"{statistics.median(distances):.1f}, {max(distances):.1f}"
         beside.append([name, ms(median["blend shapes"]), ms(limit) if limit else "–", shares, furthest])
     print("\n## A shape as a file\n")
@@ -159,6 +165,10 @@ def stages(folders: list[Path], count: int) -> None:
     print(table(("mean distance, 1e-4 of the diagonal", "auto", "full", "draft"), exact))
     print("\nIn brackets are multiples of the distance of full shapes. A product by design has a formula instead of an")
     print("exponential. For other models without modes there is no exact shape.")
+    if batches:
+        print("\nThe graph `decoder.onnx` gives the vertices of drafts in batches.\n")
+        print(table(("code → vertices, one graph", *(f"batch of {size}" for size in BATCHES), "draft / full"), batches))
+        print("\nTimes are for one shape, without a file. All columns are from one run, in turn.")
     print("\nA shape takes about a tenth of the time of an exact one, and about ten times the time of blend shapes.\n")
     print(table(("", "blend shapes", "exact exponential", "auto / full / draft, in SuperLU", "away"), beside))
     print("\n*Blend shapes* is a lower bound: it adds m displacement fields and writes the same file.")
@@ -187,6 +197,26 @@ def to_exact(model: ShapeModel, codes: Codes) -> list[str]:
                 away.setdefault(quality, []).append(float(distance))
     mean = {quality: statistics.mean(values) for quality, values in away.items()}
     return [f"{1e4 * mean[q]:.2f} ({mean[q] / mean[Quality.FULL]:.3f})" for q in Quality]
+
+
+def graph(model: ShapeModel, codes: Codes) -> list[str]:
+    """Return times of a shape by ``decoder.onnx`` in batches, beside a draft and a full shape; [] without the file."""
+    entry = model.manifest.decoder
+    if entry is None:
+        return []
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model.folder / entry.file, options, providers=["CPUExecutionProvider"])
+    times: dict[int | Quality, list[float]] = {}
+    for first in range(len(codes)):
+        for size in BATCHES:
+            batch = np.take(codes, range(first, first + size), axis=0, mode="wrap")
+            spent = seconds(partial(session.run, [entry.vertices], {entry.input: batch}))
+            times.setdefault(size, []).append(spent / size)
+        for quality in (Quality.DRAFT, Quality.FULL):
+            times.setdefault(quality, []).append(seconds(partial(model.shape, codes[first], quality=quality)))
+    median = {key: ms(statistics.median(values)) for key, values in times.items()}
+    return [*(median[size] for size in BATCHES), f"{median[Quality.DRAFT]} / {median[Quality.FULL]}"]
 
 
 def ceiling(model: ShapeModel, codes: Codes) -> float | None:

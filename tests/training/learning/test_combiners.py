@@ -17,6 +17,7 @@ from torch import nn
 from shapespace.bundle.schema import COMBINER
 from shapespace.coordinates.nric import nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
+from shapespace.torch.networks import TorchNetwork
 from shapespace.training.learning.combiners import kernels
 from shapespace.training.learning.combiners.combiner import CORRECTIONS, CombinerNetwork, choices
 from shapespace.training.learning.combiners.convolutions import (
@@ -234,6 +235,22 @@ def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings:
     again = CombinerNetwork.load(saved.metadata, ball, saved.tensors).eval()
     with torch.no_grad():
         assert torch.equal(again(x), network(x))
+
+
+@pytest.mark.parametrize(
+    "settings", [*(settings for settings, _, _ in KINDS), PaperSettings(width=4)], ids=lambda s: s.kind
+)
+def test_every_correction_runs_in_pytorch_from_its_onnx_file(ball: TriangleMesh, settings: Any) -> None:
+    x, z = interplay(ball, 60, cubic)
+    network = fitted(ball, settings, x, z, 40)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter += 0.01
+    content = to_onnx(network, x[:2], COMBINER)
+    (expected,) = onnxruntime.InferenceSession(content).run(None, {COMBINER.input: x[:5].numpy()})
+    with torch.no_grad():
+        found = TorchNetwork(content, COMBINER, torch.float32)(x[:5])
+    torch.testing.assert_close(found, torch.from_numpy(expected), atol=1e-5, rtol=1e-5)
 
 
 def test_every_kind_has_a_class() -> None:
