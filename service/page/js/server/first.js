@@ -17,8 +17,6 @@ export const listed = api.models();
 
 async function begin() {
   const models = await listed;
-  // The browser takes as long to make a context as a script takes to arrive. The renderer gets this one.
-  find("#canvas").getContext("webgl2", { antialias: true, alpha: true, stencil: false });
   const asked = new URLSearchParams(location.hash.slice(1));
   const named = models.find(({ name }) => name === asked.get("model"));
   const model = named ?? preferred(models);
