@@ -8,6 +8,7 @@ import * as api from "./api.js";
 import { LatentSpace, codeIn } from "./space.js";
 
 const PREFERRED = "figure";
+const SLOW = 4000; // ms without a shape after which the ring turns
 
 /** Return the model that is shown unless the address names another. */
 export const preferred = (models) => models.find(({ name }) => name === PREFERRED) ?? models[0];
@@ -27,4 +28,5 @@ async function begin() {
   find("#poster").src = api.posterOf(model);
 }
 
+setTimeout(() => find(".stage").classList.add("slow"), SLOW);
 begin().catch(() => {}); // the page reports it when its scripts have arrived
