@@ -20,8 +20,8 @@ def test_a_file_is_encoded(studio: OpenPage, expected: np.ndarray, server: Serve
     studio.tab("Files")
     studio["#mesh-file"].set_input_files(path)
     studio.until_code(CODE, 0.02)
-    words = studio.eventually(lambda: t if "the code of pose.obj" in (t := studio["#verdict"].inner_text()) else None)
-    assert "vertices are off by" in words
+    words = studio.eventually(lambda: t if "The shape of pose.obj" in (t := studio["#verdict"].inner_text()) else None)
+    assert "Mean vertex error" in words
     studio.page.get_by_role("button", name="Back to my shape").click()
     studio.until_code([0, 0, 0])
     studio.page.get_by_role("button", name="Show what was found").click()

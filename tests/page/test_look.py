@@ -88,8 +88,8 @@ def test_a_shape_keeps_its_colour_while_a_slider_is_dragged(studio: OpenPage) ->
 def test_sliders_are_named_by_their_motion(window: Open) -> None:
     studio = window().open("#model=figure")
     names = studio[".coordinate .name"]
-    studio.eventually(lambda: "↔" in names.nth(19).inner_text(), 300)
-    told = names.all_inner_texts()
+    studio.eventually(lambda: "↔" in (names.nth(19).text_content() or ""), 300)
+    told = names.all_text_contents()
     assert sorted(told[:2]) == ["forward ↔ back", "in ↔ out"], "the left leg"
     assert "lean right ↔ lean left" in told[12:15], "the spine"
     assert "turn left ↔ turn right" in told[17:20], "the neck"

@@ -151,7 +151,7 @@ def test_a_server_with_a_key(window: Open, start: Start, models: Path) -> None:
     assert studio["#key"].is_hidden()
 
 
-def test_the_page_stays_with_the_version_that_it_listed(window: Open, start: Start, tmp_path: Path) -> None:
+def test_the_page_stays_with_the_version_that_it_listed(start: Start, window: Open, tmp_path: Path) -> None:
     for version in ("1", "2"):
         write_bundle(tmp_path, "with-fine", version, fine=True)
     # Half of the codes would get version 2, while the card is of version 1.

@@ -136,12 +136,13 @@ def test_frames_that_never_come_are_told_and_can_be_asked_for_again(window: Open
 
     def refuse(route: Route) -> None:
         later = "12 of 25" in studio["#path-status"].inner_text()
-        problem = {"status": 504, "content_type": "application/problem+json", "body": '{"detail": "Too late."}'}
+        said = '{"type": "urn:shapespace:problem:deadline-passed", "detail": "Too late."}'
+        problem = {"status": 504, "content_type": "application/problem+json", "body": said}
         route.fulfill(**problem) if later else route.continue_()
 
     studio.page.route("**/vertices?*", refuse)
     studio["#play"].click()
-    studio.eventually(lambda: "Too late." in studio.messages)
+    studio.eventually(lambda: "did not finish in time" in studio.messages)
     studio.eventually(lambda: "Play" in studio["#play"].inner_text())
     studio.page.unroute("**/vertices?*")
     studio["#play"].click()

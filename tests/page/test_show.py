@@ -172,6 +172,7 @@ def test_the_viewer_in_a_page_of_another_origin(
 
     (tmp_path / "index.html").write_text(
         f"<!doctype html><title>Theirs</title><link rel=icon href=data:,>{code.replace(studio.url, server.url)}"
+        "<p style='height: 200vh'>"
     )
     other = window(theirs)
     other.page.goto(theirs)
@@ -184,5 +185,9 @@ def test_the_viewer_in_a_page_of_another_origin(
     picture = pixels(other.page.locator("iframe").screenshot())
     shown = np.abs(picture - picture[5, 5]).max(axis=2) > 60
     assert np.ptp(np.flatnonzero(shown[:, 10:-10].any(axis=1))) > 0.4 * len(picture)
+    # The wheel over the view scrolls the page around it.
+    other.page.locator("iframe").hover()
+    other.page.mouse.wheel(0, 120)
+    other.eventually(lambda: other.page.evaluate("scrollY") > 0)
     assert all(address.startswith(server.url) for address in other.foreign)
     other.foreign.clear()

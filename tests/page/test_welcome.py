@@ -52,5 +52,5 @@ def test_where_motion_is_not_wanted_or_a_shape_is_asked_for_nothing_moves(window
     linked = window(reduced_motion="no-preference").open("#model=with-fine&z=0.1,0,0")
     assert linked["#welcome"].is_hidden()
     for studio in (calm, linked):
-        studio.eventually(lambda studio=studio: studio[".end canvas.drawn"].count() == 9)
+        studio.eventually(lambda studio=studio: studio[".end canvas.drawn"].count() == 6)
         assert {len(asked["latents"]) for asked in studio.asked if asked["mesh"] == "fine"} == {1}

@@ -87,6 +87,7 @@ const store = /** @type {any} */ (
 
 const embedded = document.documentElement.classList.contains("embed");
 const viewer = new Viewer(find("#canvas"), embedded ? 24 : 100);
+if (embedded) viewer.shareWheel();
 const pictures = new Pictures();
 const hand = new Hand(store);
 const sliders = new Sliders(store, hand, find("#factors"));

@@ -27,7 +27,9 @@ def test_the_faces_towards_the_camera_are_drawn_inside_the_frame_and_far_ones_fi
     # The nearer one lies to the left, because the camera is on the right.
     assert paths[0][0] > paths[1][0]
     assert all(
-        0 <= x <= width and 0 <= y <= height for path in paths for x, y in zip(path[::2], path[1::2], strict=True)
+        -2 <= x <= width - 2 and -2 <= y <= height - 2
+        for path in paths
+        for x, y in zip(path[::2], path[1::2], strict=True)
     )
     up = {y for path in paths for y in path[5::6]}
     assert max(up) < max(y for path in paths for y in path[1::6]), "y is up"

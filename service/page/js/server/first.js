@@ -8,6 +8,7 @@ import * as api from "./api.js";
 import { LatentSpace, codeIn } from "./space.js";
 
 const PREFERRED = "figure";
+const SLOW = 4000; // ms without a shape after which the ring turns
 
 /** Return the model that is shown unless the address names another. */
 export const preferred = (models) => models.find(({ name }) => name === PREFERRED) ?? models[0];
@@ -17,8 +18,6 @@ export const listed = api.models();
 
 async function begin() {
   const models = await listed;
-  // The browser takes as long to make a context as a script takes to arrive. The renderer gets this one.
-  find("#canvas").getContext("webgl2", { antialias: true, alpha: true, stencil: false });
   const asked = new URLSearchParams(location.hash.slice(1));
   const named = models.find(({ name }) => name === asked.get("model"));
   const model = named ?? preferred(models);
@@ -29,4 +28,5 @@ async function begin() {
   find("#poster").src = api.posterOf(model);
 }
 
+setTimeout(() => find(".stage").classList.add("slow"), SLOW);
 begin().catch(() => {}); // the page reports it when its scripts have arrived

@@ -179,6 +179,14 @@ export class Viewer {
     if (mesh.geometry.attributes.color) paint(mesh.geometry, null, this.base);
   }
 
+  /** Leave the wheel to the page around this one until the view has the focus. */
+  shareWheel() {
+    const choose = ({ ctrlKey }) => {
+      this.controls.enableZoom = ctrlKey || document.activeElement === this.canvas;
+    };
+    this.canvas.addEventListener("wheel", choose, { capture: true, passive: true });
+  }
+
   /** Whether the view turns by itself. */
   get spins() {
     return this.controls.autoRotate;
