@@ -7,6 +7,8 @@ import { readNpz } from "./npz.js";
 import { inWords } from "./problems.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
+/** Whether there is a server that answers calls, see `static/api.js`. @type {boolean} */
+export const answersCalls = true;
 const PATIENCE = 3;
 const KEY = "shapespace-key";
 
