@@ -22,14 +22,14 @@ function sentences(card) {
   const { r2, vertex_error: error } = card.figures;
   const parts = factors.length === 1 ? "one factor" : `${factors.length} factors`;
   return [
-    `A code has ${m} ${m === 1 ? "number" : "numbers"} in ${parts}. Each shape has ${vertices} vertices and ` +
-      `${faces} faces.`,
+    `A code has ${m} ${m === 1 ? "number" : "numbers"} in ${parts}. Each shape has ${vertices} vertices ` +
+      `and ${faces} faces.`,
     r2?.composite &&
-      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of lengths and ` +
-        "angles.",
+      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of lengths ` +
+        "and angles.",
     error?.mean &&
-      `Their vertices are off by ${percent(error.mean)} of the shape’s diagonal on average, compared with ` +
-        "exact shapes.",
+      `Their vertices are off by ${percent(error.mean)} of the shape’s diagonal on average, compared ` +
+        "with exact shapes.",
     draft && `While something moves, the page shows drafts, which are off by ${percent(draft.mean)}.`,
     random &&
       `A random shape is ${percent(random.modes)} of the diagonal away from the nearest training shape. ` +

@@ -1,6 +1,6 @@
 /**
- * The pins of pulls as buttons over the shape: dragging one pulls further, pressing one removes it. A line joins
- * each pin to its vertex, and a ring marks the vertex under the pointer.
+ * The pins of pulls as buttons over the shape: dragging one pulls further, pressing one removes it. A line
+ * joins each pin to its vertex, and a ring marks the vertex under the pointer.
  */
 
 import { element, find } from "../dom.js";

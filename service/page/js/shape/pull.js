@@ -12,7 +12,7 @@ import { diagonalOf } from "../view/scene.js";
 import { fixedBy } from "../server/space.js";
 
 const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it counts as reached
-const REACH = { mouse: 12, touch: 24 }; // pixels beside the shape at which a press still means its nearest vertex
+const REACH = { mouse: 12, touch: 24 }; // pixels beside the shape at which a press means its nearest vertex
 const NEARER = 0.9; // a code that leaves more than this share of the distance does not change the shape
 
 /**

@@ -141,8 +141,8 @@ export class Sliders {
   }
 
   /**
-   * Take a number that the user types. A number beyond the slider is refused with its bound, because it may be
-   * the beginning of another; when the user has finished it, the bound takes its place.
+   * Take a number that the user types. A number beyond the slider is refused with its bound, because it may
+   * be the beginning of another; when the user has finished it, the bound takes its place.
    */
   #typed(k, box, finished) {
     const { space } = this.store;

@@ -1,6 +1,6 @@
 /** Pictures and videos of the stage, as shown. */
 
-/** Types of each format, the best first. Phones and slides play MP4 with H.264. @type {Record<string, string[]>} */
+/** Types of each format, the best first. Phones play MP4 with H.264. @type {Record<string, string[]>} */
 const TYPES = {
   mp4: ["video/mp4;codecs=avc1.640033", "video/mp4;codecs=avc1.42E01F", "video/mp4"],
   webm: ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm"],

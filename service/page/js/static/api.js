@@ -66,8 +66,12 @@ export async function reference() {
 export const textured = async () => (await content("reference.glb")).arrayBuffer();
 
 /**
- * Return the positions (3V numbers each) of some codes, and a summary of their diagnostics. There is one quality.
- * The home shape is in a file, so that it is there before the decoder.
+ * Return the positions (3V numbers each) of some codes, and a summary of their diagnostics. There is one
+ * quality. The home shape is in a file, so that it is there before the decoder.
+ * @param {object} model
+ * @param {number[][]} latents
+ * @param {string} _mesh
+ * @param {{quality?: "draft" | "full", signal?: AbortSignal}} [options]
  */
 export async function shapes(model, latents, _mesh, { quality = "full", signal } = {}) {
   const space = new LatentSpace(model);
