@@ -25,8 +25,8 @@ function sentences(card) {
     `A code has ${m} ${m === 1 ? "number" : "numbers"} in ${parts}. Each shape has ${vertices} vertices ` +
       `and ${faces} faces.`,
     r2?.composite &&
-      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of lengths ` +
-        "and angles.",
+      `On test shapes, the networks explain ${almost(r2.composite.total)}\u00a0% of the variance of ` +
+        "lengths and angles.",
     error?.mean &&
       `Their vertices are off by ${percent(error.mean)} of the shape’s diagonal on average, compared ` +
         "with exact shapes.",
