@@ -18,7 +18,7 @@ async function content(address, headers) {
 
 async function open({ runtime, decoder, headers }) {
   const [ort, graph, binary] = await Promise.all([
-    import(`${runtime}ort.wasm.bundle.min.mjs`),
+    import(`${runtime}ort.wasm.min.mjs`),
     content(decoder, headers),
     content(`${runtime}ort-wasm-simd-threaded.wasm.gz`),
   ]);
