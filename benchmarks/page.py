@@ -111,7 +111,7 @@ def main() -> None:
         page.wait_for_selector(".stage[data-shown]")
         first = time.perf_counter() - began
         weight = sum(weights.values())
-        while page.locator(".pictures canvas.drawn").count() < page.locator(".pictures canvas").count():
+        while page.locator(".end canvas.drawn").count() < page.locator(".end canvas").count():
             page.wait_for_timeout(100)
         times = sorted(slides(page, arguments.count))
         print(f"First shape {first:.2f} s after the address was entered; the page weighs {weight / 1e6:.2f} MB.")
