@@ -71,8 +71,13 @@ def address(arguments: argparse.Namespace) -> Iterator[str]:
         return
     with TemporaryDirectory() as folder:
         write_page(model=str(arguments.models / "figure"), out=Path(folder), force=False)
-        command = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", folder]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        with subprocess.Popen(
+            [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"],
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        ) as process:
             found = re.search(r"\((http://\S+)\)", process.stdout.readline() if process.stdout else "")
             if found is None:
                 raise SystemExit("the server did not start")
