@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ from shapespace.model.shape_model import ShapeModel, load
 from tests.page.conftest import Open
 from tests.page.studio import OpenPage
 from tests.page.test_texture import dressed
-from tests.service.conftest import ROOT
+from tests.service.conftest import ROOT, Server
 from tests.surfaces import png
 
 MEGABYTES = 16
@@ -143,6 +144,37 @@ def test_a_file_keeps_materials_seams_and_edges(tmp_path: Path, site: Site, wind
     assert np.allclose(found, wanted, atol=1e-5)
     assert np.array_equal(body[0][4 * numbers :], body[1][4 * numbers :])
     assert np.allclose(read_arrays(written, "glb")[0], vertices, atol=1e-5)
+
+
+def test_a_phone_computes_drafts_itself(server: Server, window: Open) -> None:
+    studio = window(has_touch=True, is_mobile=True).open("#model=figure")
+    studio.eventually(lambda: any("decoder.onnx" in address for address in studio.addresses))
+    values = iter(0.01 * np.arange(1, 1000))
+
+    def is_near() -> bool:  # until the decoder has arrived, the server is asked
+        studio.asked.clear()
+        studio.slide(0, value := float(next(values)))
+
+        def qualities() -> list[str]:
+            return [asked["quality"] for asked in studio.asked if abs(asked["latents"][0][0] - value) < 1e-6]
+
+        studio.eventually(lambda: "full" in qualities())
+        return "draft" not in qualities()
+
+    studio.eventually(is_near)
+    studio.rest()
+
+
+def test_the_graph_is_answered_once(server: Server) -> None:
+    with httpx.Client(base_url=server.url, timeout=60) as client:
+        address = client.get("/v1/models/figure").json()["links"]["decoder"]
+        answer = client.get(address)
+        assert answer.content == (ROOT / "models" / "figure" / "3" / "decoder.onnx").read_bytes()
+        assert client.get(address, headers={"If-None-Match": answer.headers["ETag"]}).status_code == 304
+        assert "decoder" not in client.get("/v1/models/with-fine").json()["links"]
+        missing = client.get("/v1/models/with-fine/decoder.onnx")
+    assert missing.status_code == 404
+    assert "with-fine has no decoder.onnx" in missing.json()["detail"]
 
 
 def test_the_runtime_is_the_file_that_its_source_names() -> None:

@@ -1,6 +1,19 @@
 /** Computes shapes in the browser, without a server. */
 
+import { LatentSpace } from "../server/space.js";
+
 const RUNTIME = new URL("../../vendor/onnxruntime/", import.meta.url).href;
+
+/** Return positions of some codes, and a summary of their diagnostics, as the server answers them. */
+export function answer(model, latents, found, quality) {
+  const space = new LatentSpace(model);
+  const inside = latents.every((code) => code.every((value, k) => space.inside(k, space.wrap(k, value))));
+  const residual = Math.max(...found.map(({ misfit }) => misfit));
+  return {
+    shapes: found.map(({ positions }) => positions),
+    diagnostics: { quality, residual, inside_bounds: inside },
+  };
+}
 
 /**
  * A model's `decoder.onnx` in a worker, which computes one code at a time. Codes of the shape on the screen
@@ -50,8 +63,11 @@ export class Decoder {
     });
   }
 
+  /** End the worker; whoever waits for a shape gets an error. */
   close() {
     this.#worker.terminate();
+    const closed = new DOMException("The decoder is closed.", "AbortError");
+    for (const { reject } of [this.#current, ...this.#waiting].filter(Boolean)) reject(closed);
   }
 
   #next() {

@@ -6,7 +6,7 @@
 import { origin, Problem } from "../server/api.js";
 import { readNpz } from "../server/npz.js";
 import { LatentSpace, sameCode } from "../server/space.js";
-import { Decoder } from "../decoder/decoder.js";
+import { answer, Decoder } from "../decoder/decoder.js";
 import { withPositions } from "./glb.js";
 
 export * from "../server/api.js";
@@ -80,13 +80,8 @@ export async function shapes(model, latents, _mesh, { quality = "full", signal }
     if (sameCode(code, space.home)) return { positions: home.data.slice(), misfit: 0 };
     return (await decoder()).shape(code, { urgent: quality === "draft", signal });
   };
-  const found = await Promise.all(latents.map(compute));
-  const inside = latents.every((code) => code.every((value, k) => space.inside(k, space.wrap(k, value))));
-  const residual = Math.max(...found.map(({ misfit }) => misfit));
-  return {
-    shapes: found.map(({ positions }) => positions),
-    diagnostics: { quality: /** @type {const} */ ("full"), residual, inside_bounds: inside },
-  };
+  // There is nothing better to ask for.
+  return answer(model, latents, await Promise.all(latents.map(compute)), "full");
 }
 
 /** Return the random code of a seed. The file has codes of the first seeds; then they begin again. */
