@@ -1,20 +1,29 @@
-"""Response time of the web page: ``python -m benchmarks.page``.
+"""Response time of the web page: ``python -m benchmarks.page``, or ``--static`` for the page without a server.
 
-Starts the server with the bundled models and opens its page in headless Chromium, with WebGL in software. The script
+Starts the server with the bundled models and opens its page in headless Chromium, with WebGL in software. With
+``--static`` a server of files shows the figure's page of `shapespace page`. The script
 in the page measures from the ``input`` event of a slider to the next frame after new pixels were read back from the
 canvas. Reading back forces the renderer to finish. The benchmark also prints the transferred bytes of the page, and
 the time from a ready server to the first shape.
 """
 
 import argparse
+import os
+import re
 import statistics
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.processes import server
+from shapespace.commands.page import page as write_page
 from tests.page.conftest import CHROMIUM, FLAGS
 
 #: Time from a slider's event to new pixels, in ms.
@@ -53,13 +62,37 @@ def slides(page: Page, count: int) -> list[float]:
     return times[3:]
 
 
+@contextmanager
+def address(arguments: argparse.Namespace) -> Iterator[str]:
+    """Start a server; yield the address of the page."""
+    if not arguments.static:
+        with server(arguments.models) as (client, *_):
+            yield str(client.base_url)
+        return
+    with TemporaryDirectory() as folder:
+        write_page(model=str(arguments.models / "figure"), out=Path(folder), force=False)
+        with subprocess.Popen(
+            [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"],
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        ) as process:
+            found = re.search(r"\((http://\S+)\)", process.stdout.readline() if process.stdout else "")
+            if found is None:
+                raise SystemExit("the server did not start")
+            yield found[1]
+            process.terminate()
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--models", type=Path, default=Path("models"), help="folder of bundles")
     parser.add_argument("--count", type=int, default=60, help="moves of a slider")
+    parser.add_argument("--static", action="store_true", help="measure the page without a server")
     arguments = parser.parse_args()
-    with server(arguments.models) as (client, *_), sync_playwright() as playwright:
+    with address(arguments) as url, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(120_000)
@@ -79,15 +112,16 @@ def main() -> None:
         devtools.on("Network.loadingFinished", finished)
         page.emulate_media(reduced_motion="reduce")  # without this the shape would move by itself
         began = time.perf_counter()
-        page.goto(str(client.base_url))
+        page.goto(url)
         page.wait_for_selector(".stage[data-shown]")
         first = time.perf_counter() - began
         weight = sum(weights.values())
-        while page.locator(".pictures canvas.drawn").count() < page.locator(".pictures canvas").count():
+        while page.locator(".end canvas.drawn").count() < page.locator(".end canvas").count():
             page.wait_for_timeout(100)
         times = sorted(slides(page, arguments.count))
         print(f"First shape {first:.2f} s after the address was entered; the page weighs {weight / 1e6:.2f} MB.")
         p50, p95 = statistics.median(times), times[int(0.95 * len(times))]
+        print(f"Load of the machine: {os.getloadavg()[0]:.1f}.")
         print(f"Slider to new pixels: median {p50:.0f} ms, 95 % {p95:.0f} ms, of {len(times)} moves.")
         browser.close()
 

@@ -25,7 +25,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
 TRAIN, SERVE, EVERY = "shapespace.training", "shapespace.service", "shapespace"
 PROGRAMS = {"shapespace-train": main, "shapespace": every_command}
 SUBCOMMANDS = ("init", "run", "status", "report", "export")
-ALL = ("decode", "encode", "fit", "models", "serve", *SUBCOMMANDS)
+ALL = ("decode", "encode", "fit", "models", "page", "serve", *SUBCOMMANDS)
 #: Runs a module where some packages can't be found, whichever way it looks for them.
 HIDING = """
 import runpy, sys

@@ -1,4 +1,4 @@
-"""The commands that use a model without a server: ``decode``, ``encode``, ``fit`` and ``models``.
+"""The commands that use a model without a server: ``decode``, ``encode``, ``fit``, ``page`` and ``models``.
 
 To add a command, write a module with its arguments and its function, and list it here. This module imports none of the
 packages that a model needs, so that ``--help`` always answers.
@@ -48,6 +48,12 @@ COMMANDS = (
         ["figure scan.ply --out fitted.glb", "figure half.ply --partial --scale free --json fit.json"],
         f"{_MODEL} SCAN is a mesh or a point cloud, in any position, without correspondence. The fitted shape lies on "
         "the scan. Check the status before you use it.",
+    ),
+    _subcommand(
+        "page",
+        "Write a web page of a model that needs no server, only a place for files.",
+        ["figure --out site", "runs/hands/models/hands --out site --force"],
+        f"{_MODEL} Any web server can show the files, also in a folder of a site. The browser computes the shapes.",
     ),
     _subcommand("models", "List the models that have a name, with version, size of a code and licence.", [""]),
 )

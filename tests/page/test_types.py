@@ -39,10 +39,10 @@ def test_every_module_is_loaded_ahead() -> None:
     links = re.findall(
         r'rel="modulepreload"( fetchpriority="low")? href="page/(.+?)"', (page / "index.html").read_text()
     )
-    modules = [*(page / "js").rglob("*.js"), *(page / "vendor").rglob("*.js")]
+    first, main = (_imported(page / "js" / name) for name in ("server/first.js", "main.js"))
+    modules = first | main | {*(page / "vendor").rglob("*.js")}
     assert sorted(path for _, path in links) == sorted(path.relative_to(page).as_posix() for path in modules)
     # What the first requests need comes first.
-    first = _imported(page / "js" / "server" / "first.js")
     assert {page / path for later, path in links if not later} == first
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import FileResponse
 from pydantic import ValidationError
 
+from shapespace.files.reading import OCTET_STREAM
 from shapespace.model.shape_model import ShapeModel
+from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Model, ServiceDependency
-from shapespace.service.http.description import problems
+from shapespace.service.http.description import binary, problems
 from shapespace.service.http.messages.schemas import (
     BesideComponents,
     GeneralisationAnswer,
@@ -18,6 +21,7 @@ from shapespace.service.http.messages.schemas import (
     ModelList,
     ModelSummary,
 )
+from shapespace.service.http.problems import ProblemError
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -39,6 +43,23 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
         compactness=_beside_components(model.manifest.figures, "compactness"),
         specificity=_beside_components(model.manifest.figures, "specificity"),
     )
+
+
+@router.get(
+    "/{name}/decoder.onnx",
+    responses=binary({"onnx": OCTET_STREAM}, "The file `decoder.onnx` of the bundle.") | problems(404, 422),
+    response_class=Response,
+)
+async def model_decoder(request: Request, model: Model) -> Response:
+    """The graph that turns codes into vertices in any ONNX runtime, if the model has one."""
+    entry = model.manifest.decoder
+    if entry is None:
+        name = model.manifest.name
+        raise ProblemError("not-found", f"{name} has no decoder.onnx. `shapespace export` adds it to a bundle.")
+    tag = entity_tag("decoder", model.manifest.files[entry.file].sha256)
+    if unchanged := not_modified(request, tag):
+        return unchanged
+    return FileResponse(model.folder / entry.file, media_type=OCTET_STREAM, headers=cache_headers(tag))
 
 
 def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:
@@ -70,6 +91,8 @@ def _facts(model: ShapeModel) -> dict[str, Any]:
         call: f"{path}/{call}"
         for call in ("mesh", "vertices", "nric", "interpolations", "encode", "fit", "edit", "sample")
     }
+    if model.manifest.decoder:
+        links["decoder"] = f"{path}/decoder.onnx"
     wanted = ModelCard.model_fields
     names = [field.alias or name for name, field in wanted.items()]
     return {name: facts[name] for name in names if name in facts} | {"links": links}

@@ -19,10 +19,15 @@ from pathlib import Path
 
 import click
 import httpx
+import numpy as np
 import pytest
 
 from shapespace.__main__ import PROGRAM
 from shapespace.command_line import Subcommand
+from shapespace.commands.page import PAGE
+from shapespace.files.formats import MESH_FORMATS
+from shapespace.files.reading import read_arrays
+from shapespace.model.shape_model import load
 from shapespace.service.settings import PREFIX, Settings
 from tests.long.__main__ import TESTS
 from tests.service.bundles import write_bundle
@@ -96,6 +101,8 @@ def try_command(line: str) -> None:
             assert isinstance(command, Subcommand)
             with suppress(click.exceptions.Exit):  # of --help
                 command.make_context(words[0], words[1:] or ["--help"])
+        case "npm":
+            assert words == ["install", "onnxruntime-web"]  # try_javascript has its runtime
         case "python" if words[0] == "-m":
             assert importlib.util.find_spec(words[1]), words[1]
         case "dask":
@@ -122,7 +129,28 @@ def try_python(text: str, server: Server, folder: Path) -> None:
 
 
 def try_javascript(text: str, server: Server, folder: Path) -> None:
+    if runs_decoder := "onnxruntime-web" in text:
+        (folder / "models").symlink_to(ROOT / "models")
+        package = folder / "node_modules" / "onnxruntime-web"
+        package.mkdir(parents=True)
+        (package / "package.json").write_text('{"type": "module", "exports": "./index.js"}')
+        vendored = PAGE / "vendor" / "onnxruntime"
+        packed = vendored / "ort-wasm-simd-threaded.wasm.gz"
+        (package / "index.js").write_text(
+            f"""import {{ readFileSync }} from "node:fs";
+            import {{ gunzipSync }} from "node:zlib";
+            import {{ env }} from {str(vendored / "ort.wasm.min.mjs")!r};
+            Object.assign(env.wasm, {{ numThreads: 1, wasmBinary: gunzipSync(readFileSync({str(packed)!r})) }});
+            export * from {str(vendored / "ort.wasm.min.mjs")!r};"""
+        )
+        model = load("figure")
+        (folder / "reference.obj").write_bytes(MESH_FORMATS["obj"].encode(model.vertices, model.faces, None, None))
     run(["node", "--input-type=module", "--eval", text], server, folder)
+    if runs_decoder:
+        found, faces = read_arrays((folder / "shape.obj").read_bytes(), "obj")[:2]
+        expected = model.shape(np.array([0.5] + 19 * [0]), quality="draft").vertices
+        assert np.array_equal(faces, model.faces)
+        assert np.abs(found - expected).max() < 2e-5 * np.linalg.norm(np.ptp(expected, axis=0))
 
 
 def try_log_line(text: str, server: Server, folder: Path) -> None:

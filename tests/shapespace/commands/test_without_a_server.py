@@ -166,6 +166,16 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
     assert "exists already" in shell.err
 
 
+def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("mine")
+    shell("page", "figure", "--out", tmp_path, code=1)
+    assert "index.html: exists already" in shell.err
+    assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
+    shell("page", "figure", "--out", tmp_path, "--force")
+    assert "python -m http.server" in shell.err
+    assert "mine" not in (tmp_path / "index.html").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
@@ -175,6 +185,8 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
         ("decode small --out x.xyz", 1, "there is no format 'xyz'; choose among glb, gltf, obj"),
         ("decode small --out models/small/1/README.md", 1, "there is no format 'md'"),
         ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
+        ("page small --out site", 1, "small has no decoder.onnx, which computes shapes in the browser"),
+        ("page small --out plain", 1, "plain is a file; name a folder"),
         ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
         ("fit small a.ply --json plain", 1, "plain: exists already"),
         ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3"),

@@ -7,6 +7,8 @@ import { readNpz } from "./npz.js";
 import { inWords } from "./problems.js";
 
 export const origin = new URL(".", document.baseURI).href.replace(/\/$/, "");
+/** Whether there is a server that answers calls, see `static/api.js`. @type {boolean} */
+export const answersCalls = true;
 const PATIENCE = 3;
 const KEY = "shapespace-key";
 
@@ -112,6 +114,47 @@ export const ready = () =>
 
 const diagnosticsOf = (response) => JSON.parse(response.headers.get("Shape-Diagnostics") ?? "{}");
 
+/** Phones compute drafts themselves, because each answer takes a round trip. */
+const isPhone =
+  matchMedia("(pointer: coarse)").matches && !(/** @type {any} */ (navigator).connection?.saveData);
+const MISFIT = 0.2; // above it the server solves the shape instead
+let near = { model: null, decoder: null, isReady: false };
+
+/** Return the decoder of a model if it is there. The first call begins to load it. */
+function decoderOf(model, mesh) {
+  if (!isPhone || mesh !== "fine" || !model.links.decoder) return null;
+  if (near.model !== model) {
+    near.decoder?.close();
+    const mine = { model, decoder: null, isReady: false };
+    near = mine;
+    const open = async () => {
+      const { Decoder } = await import("../decoder/decoder.js");
+      if (near !== mine) return;
+      const key = here.kept(KEY);
+      mine.decoder = new Decoder(origin + at(model, "decoder.onnx"), key ? { "X-API-Key": key } : {});
+      await mine.decoder.ready;
+      mine.isReady = true;
+    };
+    open().catch(() => {}); // the server computes drafts too
+  }
+  return near.isReady ? near.decoder : null;
+}
+
+/** Return drafts that this device has computed, or null. */
+async function ownDrafts(model, latents, mesh, signal) {
+  const decoder = decoderOf(model, mesh);
+  if (!decoder) return null;
+  try {
+    const found = await Promise.all(latents.map((code) => decoder.shape(code, { urgent: true, signal })));
+    const { answer } = await import("../decoder/decoder.js");
+    const drafts = answer(model, latents, found, "draft");
+    return drafts.diagnostics.residual > MISFIT ? null : drafts;
+  } catch {
+    signal?.throwIfAborted();
+    return null;
+  }
+}
+
 /** Return positions and faces of the reference. */
 export async function reference(model, mesh) {
   const asked = taken(nameOf(model, mesh));
@@ -134,6 +177,8 @@ export const textured = async (model) => (await call(at(model, "mesh", { format:
 export async function shapes(model, latents, mesh, { quality = "full", signal } = {}) {
   const asked = taken(nameOf(model, latents, mesh, quality));
   if (asked) return asked;
+  const own = quality === "draft" ? await ownDrafts(model, latents, mesh, signal) : null;
+  if (own) return own;
   const body = { latents, mesh, quality, faces: false };
   const response = await post(at(model, "vertices", { format: "npz" }), body, signal);
   const { vertices } = await readNpz(await response.arrayBuffer(), ["vertices"]);

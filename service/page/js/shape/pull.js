@@ -35,6 +35,10 @@ export class Pull {
     this.viewer = viewer;
     const { canvas } = viewer;
     store.on(["pull"], () => {
+      if (store.pull && !api.answersCalls) {
+        store.set({ pull: false });
+        api.edit(store.model, {}).catch(report); // which says why
+      }
       canvas.classList.toggle("pulling", store.pull);
       store.set({ hover: null });
     });

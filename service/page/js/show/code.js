@@ -11,6 +11,9 @@ const json = (body) => JSON.stringify(body);
  * @property {string} title of the model
  */
 
+/** The text that needs no call. */
+export const FRAME = "a frame in a page";
+
 /** Writers of the texts, by their names in the page. @type {Record<string, (call: Call) => string>} */
 export const CODE = {
   curl: ({ url, body, file }) =>
@@ -34,7 +37,7 @@ if (!answer.ok) throw new Error(await answer.text());
 const file = await answer.arrayBuffer();
 `,
 
-  "a frame in a page": ({ embed, title }) => {
+  [FRAME]: ({ embed, title }) => {
     const plain = (text) => text.replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
     const look = 'width="480" height="480" style="border:0"';
     return `<iframe src="${plain(embed)}" title="${plain(title)}" ${look}></iframe>`;

@@ -5,7 +5,7 @@ import * as api from "../server/api.js";
 import { baseOf } from "../view/colouring.js";
 import { element, find, readable } from "../dom.js";
 import { reporting, say } from "../messages.js";
-import { CODE } from "./code.js";
+import { CODE, FRAME } from "./code.js";
 import { picture, record, turntable, videoFormats } from "./video.js";
 
 /** Formats of one shape. */
@@ -38,10 +38,12 @@ export class Files {
     this.path = path;
     this.viewer = viewer;
     this.format = find("#format", root);
-    this.format.append(...SHAPE_FORMATS.map((name) => element("option", { textContent: name })));
+    const formats = api.answersCalls ? SHAPE_FORMATS : ["glb"];
+    this.format.append(...formats.map((name) => element("option", { textContent: name })));
     this.code = find("#code", root);
     this.language = find("#language", root);
-    this.language.append(...Object.keys(CODE).map((name) => element("option", { textContent: name })));
+    const languages = Object.keys(CODE).filter((name) => api.answersCalls || name === FRAME);
+    this.language.append(...languages.map((name) => element("option", { textContent: name })));
     this.language.addEventListener("change", () => this.#tell());
     this.seconds = find("#turntable-seconds", root);
     this.animation = find("#animation-format");
