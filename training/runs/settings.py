@@ -48,6 +48,8 @@ class SettingsTable(BaseModel):
 class CollectionSettings(SettingsTable):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
+
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
     """Name of a built-in generator, which makes the shapes itself. ``expressive`` is a body in 149 poses: 100 with
     moving hands and face, 49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need the extra
@@ -105,6 +107,8 @@ class ExponentialSettings(SettingsTable):
 class ModeSettings(SettingsTable):
     """The modes: the directions in which shapes differ from their mean, found by sparse principal geodesic analysis."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
+
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
     mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
@@ -129,11 +133,6 @@ class ModeSettings(SettingsTable):
     shapes fold."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
-
-    @property
-    def key(self) -> dict[str, Any]:
-        """The settings in the keys of stages. Runs of version 0.2 keep their keys: it had exponentials only."""
-        return self.model_dump(mode="json", exclude={"geometry"} if self.geometry == "exponential" else None)
 
 
 class FactorSettings(SettingsTable):
@@ -218,6 +217,8 @@ def _grid(nodes: int) -> int:
 class EvaluationSettings(SettingsTable):
     """How the model is measured on the test samples."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"baselines"})
+
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
     baselines: bool = False
@@ -243,6 +244,8 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 class ExportSettings(SettingsTable):
     """Name and description of the exported bundle."""
+
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"decoder"})
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
     """Name of the model in addresses and file names."""

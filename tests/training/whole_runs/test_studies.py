@@ -17,7 +17,7 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.network_settings import ProductSettings, Recipe
+from shapespace.training.runs.network_settings import FitSettings, ProductSettings, Recipe
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY
@@ -121,6 +121,19 @@ def test_studies_add_their_figures_and_networks_to_a_finished_run(copy: Run) -> 
         assert said["total"] == pytest.approx(found, abs=1e-6)
     assert other.split["test"].tolist() != learner.split["test"].tolist()
     assert {path.stem: path.read_bytes() for path in directory.networks()} == networks, "learned again"
+
+
+def test_all_networks_are_tuned_together_once(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, settings = learner_of(copy), copy.config.networks
+    tuned = settings.model_copy(update={"fine_tuning": FitSettings(max_epochs=2, batch_size=8)})
+    first, plain = learner.composite(tuned), learner.main()
+    assert sum(name.startswith("joint-") for name in learner.histories) == 1
+    codes = torch.as_tensor(learner.joint.latents[:3], dtype=torch.float32)
+    monkeypatch.setattr(Learner, "joint", None)  # samples are not needed any more
+    again = learner_of(copy).composite(tuned)
+    with torch.no_grad():
+        assert torch.equal(first(codes), again(codes))
+        assert not torch.equal(first(codes), plain(codes))
 
 
 def test_every_run_of_the_pages_has_valid_studies() -> None:
