@@ -39,8 +39,11 @@ from shapespace.training.runs.network_settings import (
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
 from shapespace.training.space.straight_collection import StraightCollection
 
-#: Settings of the paper's factor networks.
-PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
+#: The paper's own system (section 4): dense perceptrons of bare angles, and its combiner.
+PAPER = Recipe(
+    factors=LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings()),
+    combiner=CombinerSettings(correction=PaperSettings(), symmetries=False),
+)
 
 
 @dataclass(frozen=True)
@@ -330,9 +333,8 @@ class Learner:
         return self.composite(self.config.networks)
 
     def paper(self) -> Composite:
-        """Return the paper's own system (section 4): dense perceptrons of bare angles, and its combiner."""
-        combiner = CombinerSettings(correction=PaperSettings(), symmetries=False)
-        return self.composite(Recipe(factors=PAPER_FACTORS, combiner=combiner))
+        """Return the paper's own system."""
+        return self.composite(PAPER)
 
     def monolithic(self) -> Composite:
         """Return our recipe with one factor of all latents, fitted to the joint samples."""
