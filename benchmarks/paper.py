@@ -37,7 +37,8 @@ from shapespace.training.stages.stage import Run
 ROUNDING = 1e-6
 
 
-#: The paper's system with sizes and orders of layers that validation codes chose (NOTES.md, The paper's own system).
+#: The paper's system with factor networks that validation codes of the bump chose (NOTES.md, The paper's own system).
+#: Its combiner has the paper's order of layers and the sizes of `PAPER`; other sizes have not been tried.
 CHOSEN = Recipe(
     factors=LatentNetworkSettings(
         hidden=[512, 512, 512],
