@@ -33,6 +33,7 @@ NO_MATHEMATICS = {
     "shapespace.model.networks",
     "shapespace.model.options",
     "shapespace.model.shape_model",
+    "shapespace.training.learning.device",
     "shapespace.training.learning.export",
     "shapespace.training.learning.naming",
 }

@@ -21,7 +21,7 @@ from shapespace.model.accuracy import measure_accuracy
 from shapespace.model.decoder import Decoder
 from shapespace.training.collection import init
 from shapespace.training.collection.faults import IngestError
-from shapespace.training.learning import ExportError
+from shapespace.training.learning import DeviceError, ExportError
 from shapespace.training.report.record import ReportError, require_run
 from shapespace.training.runs import workers
 from shapespace.training.runs.atomic_files import DamagedFileError
@@ -41,6 +41,7 @@ EXPECTED = (
     BundleError,
     ConfigError,
     DamagedFileError,
+    DeviceError,
     ExportError,
     FactorError,
     IngestError,

@@ -3,3 +3,7 @@
 
 class ExportError(RuntimeError):
     """The exported bundle differs from the networks in PyTorch, or cannot be read."""
+
+
+class DeviceError(RuntimeError):
+    """A device that PyTorch does not find, with a sentence that says what to do."""

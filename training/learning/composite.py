@@ -1,11 +1,11 @@
 """The composite network ``Φ = Ψ ∘ (ψ_1, …, ψ_J)`` (paper, section 3), and the affine sum that it corrects."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
 from shapespace.training.learning.networks import ShapeNetwork
@@ -33,9 +33,32 @@ class Composite:
         return factor_shapes(self.networks, self.factors, latents)
 
 
-def factor_shapes(networks: Sequence[ShapeNetwork], factors: list[list[int]], latents: Tensor) -> Tensor:
+class TunedNetwork(ShapeNetwork):
+    """A composite as one network from codes (n, m) to NRIC (n, 2E), whose parts are trained together."""
+
+    def __init__(self, composite: Composite) -> None:
+        super().__init__()
+        self.factors = composite.factors
+        self.networks, self.combiner = nn.ModuleList(composite.networks), composite.combiner
+
+    def target(self, z: Tensor) -> Tensor:
+        """Return scaled differences (n, 2E) of NRIC."""
+        return self.combiner.target(z)
+
+    def coefficients(self, inputs: Tensor) -> Tensor:
+        """Return scaled differences (n, 2E) of the joint shape for codes (n, m)."""
+        return self.combiner.coefficients(factor_shapes(self.networks, self.factors, inputs))
+
+    def loss(self, inputs: Tensor, target: Tensor) -> Tensor:
+        """Return the combiner's loss for codes (n, m)."""
+        return self.combiner.loss(factor_shapes(self.networks, self.factors, inputs), target)
+
+
+def factor_shapes(networks: Iterable[nn.Module], factors: list[list[int]], latents: Tensor) -> Tensor:
     """Return NRIC (n, J, 2E) of each factor's network for its part of codes (n, m)."""
-    return torch.stack([network(latents[:, index]) for network, index in zip(networks, factors, strict=True)], dim=1)
+    columns = latents.unbind(dim=1)
+    parts = (torch.stack([columns[j] for j in index], dim=1) for index in factors)
+    return torch.stack([network(part) for network, part in zip(networks, parts, strict=True)], dim=1)
 
 
 def affine_sum(reference: NDArray, factors: NDArray) -> NDArray:

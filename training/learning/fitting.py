@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import CosineAnnealingLR, ReduceLROnPlateau
 
 from shapespace.files.atomic import replaced_file
 from shapespace.training.learning.allocator import memory_kept
+from shapespace.training.learning.device import CPU, random_state, restore_random_state
 from shapespace.training.learning.networks import ShapeNetwork, predict
 from shapespace.training.runs.atomic_files import reading
 from shapespace.training.runs.network_settings import FitSettings
@@ -47,7 +48,7 @@ def save_network(
 ) -> None:
     """Write a network and its training state as one safetensors file, atomically."""
     tensors = {f"network.{k}": v for k, v in network.state_dict().items()} | (extra or {})
-    tensors = {k: v.contiguous().clone() for k, v in tensors.items()}
+    tensors = {k: v.cpu().contiguous().clone() for k, v in tensors.items()}
     with replaced_file(path) as file:
         file.write(save(tensors, metadata={"state": json.dumps(state), **network.metadata}))
 
@@ -73,6 +74,7 @@ def fit(
     path: Path,
     title: str,
     seed: int,
+    device: torch.device = CPU,
 ) -> dict[str, Any]:
     """Fit a network to NRIC samples, and save its state after the epoch with the least validation loss.
 
@@ -82,34 +84,38 @@ def fit(
 
     Inputs (n, …) and NRIC z (n, 2E) are of all samples. ``train`` and ``validation`` are indices of samples; the
     validation samples choose the learning rate and the epoch. The seed determines the order of batches and dropout.
-    Returns the state, see `SavedNetwork`.
+    The network is trained on the device. Samples stay in main memory, and batches go to the device. In the end, the
+    network is on the processor again. Returns the state, see `SavedNetwork`.
     """
     with torch.no_grad():
         target = network.target(z)
+    saved = read_network(path) if path.exists() else None
+    if saved:
+        network.load_state_dict(saved.tensors)
+        if saved.done:
+            network.eval()
+            return saved.state
+    network.to(device)
     optimisers = _optimisers(network, settings)
     schedules = [_schedule(optimiser, settings) for optimiser in optimisers]
     torch.manual_seed(seed)
-    if path.exists():
-        saved = read_network(path)
-        network.load_state_dict(saved.tensors)
+    if saved:
         state = saved.state
-        if saved.done:
-            network.eval()
-            return state
         best = _restore(optimisers, schedules, state, saved.extra)
+        restore_random_state(device, saved.extra)
     else:
         # The closed-form fit may be better than any epoch.
         network.eval()
-        error = _error(network, inputs[validation], target[validation], settings.batch_size)
+        error = _error(network, inputs[validation], target[validation], settings.batch_size, device)
         state = {"done": False, "epoch": 0, "epochs": settings.max_epochs, "best": error, "history": []}
         best = _copied(network)
 
     epochs = bar(title, "epoch", settings.max_epochs, initial=state["epoch"])
     while not state["done"]:
         start = time.monotonic()
-        total = _epoch(network, optimisers, inputs, target, train, settings.batch_size)
+        total = _epoch(network, optimisers, inputs, target, train, settings.batch_size, device)
         network.eval()
-        error = _error(network, inputs[validation], target[validation], settings.batch_size)
+        error = _error(network, inputs[validation], target[validation], settings.batch_size, device)
         if settings.minutes and not state["epoch"]:
             _shorten(state, schedules, 60 * settings.minutes / (time.monotonic() - start))
         for schedule in schedules:
@@ -127,9 +133,9 @@ def fit(
         epochs.update()
         state["done"] = state["epoch"] >= state["epochs"] or rate < settings.final_rate
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:
-            _checkpoint(path, network, optimisers, schedules, state, best)
+            _checkpoint(path, network, optimisers, schedules, state, best, random_state(device))
     epochs.close()
-    network.load_state_dict(best)
+    network.to(CPU).load_state_dict(best)
     network.eval()
     save_network(path, network, state)
     return state
@@ -138,12 +144,17 @@ def fit(
 def _optimisers(network: nn.Module, settings: FitSettings) -> list[Optimizer]:
     parameters = list(network.parameters())
     if settings.optimiser == "adam":
-        return [Adam(parameters, settings.learning_rate)]
+        return [_adam(parameters, settings)]
     matrices = [p for p in parameters if p.ndim == 2]
     others = [p for p in parameters if p.ndim != 2]
     # One rate suits both, since Muon's steps are made as large as Adam's.
-    muon = Muon(matrices, settings.learning_rate, weight_decay=0, adjust_lr_fn="match_rms_adamw")
-    return [muon, Adam(others, settings.learning_rate)]
+    muon = Muon(matrices, settings.learning_rate, weight_decay=settings.weight_decay, adjust_lr_fn="match_rms_adamw")
+    return [muon, _adam(others, settings)]
+
+
+def _adam(parameters: list[nn.Parameter], settings: FitSettings) -> Adam:
+    decay = settings.weight_decay
+    return Adam(parameters, settings.learning_rate, weight_decay=decay, decoupled_weight_decay=decay > 0)
 
 
 #: Schedule of a learning rate.
@@ -163,6 +174,7 @@ def _epoch(
     target: Tensor,
     train: Tensor,
     batch_size: int,
+    device: torch.device,
 ) -> float:
     """Pass once over the training samples in random order, and return the mean loss of the batches."""
     network.train()
@@ -171,7 +183,7 @@ def _epoch(
     # A last batch of fewer samples is left out: batch normalisation of one sample has no variance.
     batches = [b for b in order.split(batch_size) if len(b) == batch_size] or [order]
     for batch in batches:
-        loss = network.loss(inputs[batch], target[batch])
+        loss = network.loss(inputs[batch].to(device), target[batch].to(device))
         network.zero_grad()
         loss.backward()
         for optimiser in optimisers:
@@ -192,8 +204,9 @@ def _shorten(state: dict[str, Any], schedules: Sequence[Schedule], affordable: f
             schedule.T_max = state["epochs"]
 
 
-def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: int) -> float:
-    return network.error(predict(network.coefficients, inputs, batch_size), target).item()
+def _error(network: ShapeNetwork, inputs: Tensor, target: Tensor, batch_size: int, device: torch.device) -> float:
+    found = predict(lambda part: network.coefficients(part.to(device)), inputs, batch_size)
+    return network.error(found, target.to(device)).item()
 
 
 def _checkpoint(
@@ -203,6 +216,7 @@ def _checkpoint(
     schedules: Sequence[Schedule],
     state: dict[str, Any],
     best: dict[str, Tensor],
+    random: dict[str, Tensor],
 ) -> None:
     moments = {
         f"optimiser.{k}.{index}.{key}": value
@@ -210,7 +224,7 @@ def _checkpoint(
         for index, values in optimiser.state_dict()["state"].items()
         for key, value in values.items()
     }
-    extra = {f"best.{k}": v for k, v in best.items()} | moments | {"rng": torch.get_rng_state()}
+    extra = {f"best.{k}": v for k, v in best.items()} | moments | {"rng": torch.get_rng_state()} | random
     rates = [optimiser.param_groups[0]["lr"] for optimiser in optimisers]
     save_network(path, network, state | {"rates": rates, "schedules": [s.state_dict() for s in schedules]}, extra)
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.training.learning.linear import principal_axes
+from shapespace.training.runs.network_settings import Normalisation
 
 #: Smallest number of entries of a tensor that is stored in 8 or 16 bits, if these hold its values exactly.
 NARROWED_SIZE = 1024
@@ -191,9 +192,11 @@ class PatchBasis(nn.Module):
         return y.index_select(1, self.place) + self.mean
 
 
-def perceptron(sizes: list[int]) -> nn.Sequential:
-    """Return ``MLP[N_1, …, N_T]`` with ELU and batch normalisation after each hidden layer."""
+def perceptron(sizes: list[int], normalisation: Normalisation = "before", dropout: float = 0) -> nn.Sequential:
+    """Return ``MLP[N_1, …, N_T]`` with ELU and batch normalisation, and perhaps dropout, in each hidden layer."""
     layers: list[nn.Module] = []
     for n_in, n_out in itertools.pairwise(sizes[:-1]):
-        layers += [nn.Linear(n_in, n_out), nn.BatchNorm1d(n_out), nn.ELU()]
+        norms = [] if normalisation == "none" else [nn.BatchNorm1d(n_out)]
+        ends = [*norms, nn.ELU()] if normalisation == "before" else [nn.ELU(), *norms]
+        layers += [nn.Linear(n_in, n_out), *ends, *([nn.Dropout(dropout)] if dropout else [])]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))

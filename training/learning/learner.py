@@ -21,7 +21,8 @@ from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.combiners.combiner import CombinerNetwork, choices
 from shapespace.training.learning.combiners.correction import JointSamples, Motion, Slopes
-from shapespace.training.learning.composite import Composite, factor_shapes
+from shapespace.training.learning.composite import Composite, TunedNetwork, factor_shapes
+from shapespace.training.learning.device import training_device
 from shapespace.training.learning.fitting import fit, read_network, save_network
 from shapespace.training.learning.layers import PatchBasis, Scaling
 from shapespace.training.learning.networks import FactorNetwork, ShapeNetwork, StartNetwork, predict
@@ -38,8 +39,11 @@ from shapespace.training.runs.network_settings import (
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, Collection, Samples, columns, read
 from shapespace.training.space.straight_collection import StraightCollection
 
-#: Settings of the paper's factor networks.
-PAPER_FACTORS = LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings())
+#: The paper's own system (section 4): dense perceptrons of bare angles, and its combiner.
+PAPER = Recipe(
+    factors=LatentNetworkSettings(fourier=0, skip_degree=0, energy=1, fit=FitSettings()),
+    combiner=CombinerSettings(correction=PaperSettings(), symmetries=False),
+)
 
 
 @dataclass(frozen=True)
@@ -120,14 +124,21 @@ class Learner:
             path,
             title=self._words(path),
             seed=self.seed,
+            device=self.device,
         )
+
+    @cached_property
+    def device(self) -> torch.device:
+        """Where networks are trained by gradient descent; raises DeviceError if PyTorch does not find the device."""
+        return training_device(self.config.networks.device)
 
     def _words(self, path: Path) -> str:
         """Say for the progress what the network in a file learns."""
         kind, _, number = path.stem.rpartition("-")[0].partition("-")
         if kind == "factor":
             return f"learning factor {list(self.collection.factors)[int(number)]!r}"
-        return "learning how factors join" if kind == "combiner" else "learning a network to compare with"
+        known = {"combiner": "learning how factors join", "joint": "tuning all networks together"}
+        return known.get(kind, "learning a network to compare with")
 
     def _record(self, path: Path, state: dict[str, Any]) -> None:
         self.histories[path.stem] = {k: state[k] for k in ("epoch", "best", "history")}
@@ -209,7 +220,23 @@ class Learner:
         networks = [self.factor(j, settings) for j, settings in enumerate(factors)]
         decides = [*factors, *choices(recipe.combiner.correction)]
         path = self._path("combiner", [self.share, self.factor_share], recipe.combiner, *decides)
-        return Composite(indices, networks, self._combiner(recipe.combiner, path, indices, networks))
+        composite = Composite(indices, networks, self._combiner(recipe.combiner, path, indices, networks))
+        if recipe.fine_tuning is not None:
+            path = self._path("joint", [self.share, self.factor_share], recipe.fine_tuning, recipe.combiner, *decides)
+            self._tune(composite, recipe.fine_tuning, path)
+        return composite
+
+    def _tune(self, composite: Composite, settings: FitSettings, path: Path) -> None:
+        """Train all networks of a composite together on the joint samples, or read them from ``path``."""
+        network, saved = TunedNetwork(composite), read_network(path) if path.exists() else None
+        if saved and saved.done:
+            network.load_state_dict(saved.tensors)
+            state = saved.state
+        else:
+            latents = torch.as_tensor(self.joint.latents, dtype=torch.float32)
+            state = self._fit(network, TrainingData(latents, self.joint.nric, self.rows), settings, path, self.share)
+        network.eval()
+        self._record(path, state)
 
     def _combiner(
         self, settings: CombinerSettings, path: Path, indices: list[list[int]], networks: list[FactorNetwork]
@@ -306,9 +333,8 @@ class Learner:
         return self.composite(self.config.networks)
 
     def paper(self) -> Composite:
-        """Return the paper's own system (section 4): dense perceptrons of bare angles, and its combiner."""
-        combiner = CombinerSettings(correction=PaperSettings(), symmetries=False)
-        return self.composite(Recipe(factors=PAPER_FACTORS, combiner=combiner))
+        """Return the paper's own system."""
+        return self.composite(PAPER)
 
     def monolithic(self) -> Composite:
         """Return our recipe with one factor of all latents, fitted to the joint samples."""

@@ -64,10 +64,11 @@ class FactorNetwork(ShapeNetwork):
     ) -> None:
         super().__init__()
         self.scaling, self.basis = scaling, basis
-        self.metric: Tensor | None = None  # (rank, rank) factor of coefficient errors
+        self.metric: Tensor | None  # (rank, rank) factor of coefficient errors, for training only
+        self.register_buffer("metric", None, persistent=False)
         size = basis.rank if basis is not None else len(scaling.mean)
         self.features = LatentFeatures(coordinates, settings.fourier)
-        self.hidden = perceptron([self.features.size, *settings.hidden, size])
+        self.hidden = perceptron([self.features.size, *settings.hidden, size], settings.normalisation)
         self.skip_features: FourierProducts | Polynomials | None = None
         if settings.skip_orders:
             self.skip_features = FourierProducts(coordinates, settings.skip_orders)

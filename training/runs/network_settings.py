@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -10,10 +10,14 @@ from shapespace.training.runs.settings import SettingsTable
 
 #: The edges from which a convolution takes its input, see convolutions.EdgeConvolution.
 Neighbourhood = Literal["star", "flaps"]
+#: Where batch normalisation stands in a layer: before its activation, after it, or nowhere.
+Normalisation = Literal["before", "after", "none"]
 
 
 class FitSettings(SettingsTable):
     """How a network is trained by gradient descent."""
+
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"weight_decay"})
 
     optimiser: Literal["adam", "muon"] = "adam"
     """``adam``, as in the paper, or ``muon``. Muon updates matrices by their orthogonalised momentum and all else as
@@ -24,6 +28,8 @@ class FitSettings(SettingsTable):
     ``max_epochs``. It needs fewer epochs."""
     learning_rate: float = Field(1e-3, gt=0)
     """Initial learning rate."""
+    weight_decay: float = Field(0, ge=0)
+    """Share of each weight that a step removes, per unit of the learning rate."""
     final_rate: float = Field(1e-6, gt=0)
     """Training ends when the learning rate falls below this."""
     patience: int = Field(10, ge=1)
@@ -42,8 +48,12 @@ class LatentNetworkSettings(SettingsTable):
     The baseline ``monolithic`` is this network with one factor. ``monolithic_paper`` is the paper's monolithic network.
     """
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation"})
+
     hidden: list[int] = Field([128, 128])
     """Width of each hidden layer."""
+    normalisation: Normalisation = "before"
+    """Batch normalisation in each hidden layer: ``before`` or ``after`` its activation, or ``none``."""
     fourier: int = Field(1, ge=0)
     """Highest frequency of a periodic coordinate among the inputs. 0 takes the angle itself, as the paper does."""
     skip_orders: list[int] = Field([])
@@ -102,6 +112,8 @@ class SumSettings(SettingsTable):
 class ConvolutionSettings(SettingsTable):
     """Graph convolutions on the edges, trained by gradient descent."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "integrability"})
+
     kind: Literal["convolutions"] = "convolutions"
     layers: int = Field(3, ge=1)
     """Number of successive convolutions."""
@@ -123,16 +135,43 @@ class ConvolutionSettings(SettingsTable):
     0 leaves them out. Needs ``residual``."""
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of the features that are set to zero after each layer during training."""
+    normalisation: Normalisation = "before"
+    """Batch normalisation in each layer: ``before`` or ``after`` its activation, or ``none``."""
+    integrability: float = Field(0, ge=0)
+    """Weight of lengths and angles that fit no surface, as in the factor networks. Needs ``crop = 0``."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
     """How the network is trained."""
 
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
+        if self.crop and self.integrability:
+            raise ValueError("integrability needs whole shapes: set crop = 0")
         if self.crop and self.neighbourhood != "flaps":
             raise ValueError('crop needs neighbourhood = "flaps"')
         if self.products and not self.residual:
             raise ValueError("products need residual = true")
         return self
+
+
+class DenseSettings(SettingsTable):
+    """A fully connected network on the shapes of all factors, which the paper names beside convolutions (section 3).
+
+    It has a weight for each pair of a length or angle and a unit of the first layer, so it is large.
+    """
+
+    kind: Literal["dense"] = "dense"
+    hidden: list[Annotated[int, Field(ge=1)]] = Field([256, 256])
+    """Width of each hidden layer."""
+    residual: bool = True
+    """Whether the network learns the difference from the affine sum of the factors, or the joint shape itself."""
+    dropout: float = Field(0.0, ge=0, lt=1)
+    """Share of the features that are set to zero after each hidden layer during training."""
+    normalisation: Normalisation = "after"
+    """Batch normalisation in each hidden layer: ``before`` or ``after`` its activation, or ``none``."""
+    integrability: float = Field(0, ge=0)
+    """Weight of lengths and angles that fit no surface, as in the factor networks."""
+    fit: FitSettings = FitSettings(schedule="cosine", max_epochs=60)
+    """How the network is trained."""
 
 
 class FieldSettings(SettingsTable):
@@ -166,20 +205,26 @@ class PaperSettings(SettingsTable):
     Adam starts with a learning rate of 1e-3 and divides it by ten on a plateau.
     """
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "integrability"})
+
     kind: Literal["paper"] = "paper"
     layers: int = Field(3, ge=1)
     """Number of successive convolutions."""
     width: int = Field(24, ge=1)
     """Number of features of each edge after each layer."""
+    normalisation: Normalisation = "before"
+    """Batch normalisation in each layer: ``before`` or ``after`` its activation, or ``none``. The paper has it after
+    each layer."""
+    integrability: float = Field(0, ge=0)
+    """Weight of lengths and angles that fit no surface, which the paper suggests in its outlook."""
     fit: FitSettings = FitSettings()
     """How the network is trained."""
 
     @property
     def convolutions(self) -> ConvolutionSettings:
         """The equivalent convolutions, with every setting written out."""
-        return ConvolutionSettings(
-            layers=self.layers, width=self.width, residual=False, edge_channels=0, dropout=0.1, fit=self.fit
-        )
+        own = {name: getattr(self, name) for name in ("layers", "width", "normalisation", "integrability", "fit")}
+        return ConvolutionSettings(residual=False, edge_channels=0, dropout=0.1, **own)
 
 
 class AutoSettings(SettingsTable):
@@ -197,7 +242,8 @@ class AutoSettings(SettingsTable):
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
 ResolvedCorrection = Annotated[
-    KernelSettings | ProductSettings | SumSettings | ConvolutionSettings | FieldSettings, Field(discriminator="kind")
+    KernelSettings | ProductSettings | SumSettings | ConvolutionSettings | DenseSettings | FieldSettings,
+    Field(discriminator="kind"),
 ]
 CorrectionSettings = Annotated[ResolvedCorrection | PaperSettings | AutoSettings, Field(discriminator="kind")]
 
@@ -236,15 +282,26 @@ class CombinerSettings(SettingsTable):
 class Recipe(SettingsTable):
     """The parts of the composite network."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"fine_tuning"})
+
     factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
     """Settings of the factor networks: one table for each factor, or one for all."""
     combiner: CombinerSettings = CombinerSettings()
     """The network that joins the factors' shapes."""
+    fine_tuning: FitSettings | None = None
+    """How all networks are trained once more, together, on the joint samples. The paper trains factors and combiner one
+    after the other, and so do we if you leave this out. Parts of a combiner that were found in closed form stay."""
 
 
 class NetworkSettings(Recipe):
     """The networks that are exported, and those that are trained for comparison."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = Recipe.SINCE_0_3 | {"device"}
+
+    device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Where networks are trained by gradient descent: on the processor, on an NVIDIA or AMD GPU (``cuda``), or on the
+    GPU of an Apple computer (``mps``). ``auto`` takes a GPU if PyTorch finds one. See
+    [how to train on a GPU](../how-to/gpu.md). A change of the device trains no network again."""
     seed: int = 0
     """Seed of the networks' initial weights and of the order of the samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from shapespace.coordinates.reconstruction import DEFAULT_ETA
 from shapespace.shell.energy import Material
 from shapespace.shell.space import FirstStep
+from shapespace.training.runs.latent_coordinates import Distribution
 
 #: A mesh with at most this multiple of ``coarse_vertices`` keeps all its vertices. Simplification would lose more in
 #: accuracy than it gains in time.
@@ -25,10 +34,21 @@ class SettingsTable(BaseModel):
 
     # Docstrings under the fields are their descriptions, from which docs/reference/configuration.md is written.
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    #: Settings that version 0.2 did not have. They are left out of dumps where they have their defaults. So stages and
+    #: networks of its runs keep their keys, which are digests of dumps.
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _without_new_defaults(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        usual = {name for name in self.SINCE_0_3 if getattr(self, name) == fields[name].default}
+        return {name: value for name, value in dump(self).items() if name not in usual}
 
 
 class CollectionSettings(SettingsTable):
     """Where the shapes come from: a built-in generator, or meshes in correspondence."""
+
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
     """Name of a built-in generator, which makes the shapes itself. ``expressive`` is a body in 149 poses: 100 with
@@ -87,6 +107,8 @@ class ExponentialSettings(SettingsTable):
 class ModeSettings(SettingsTable):
     """The modes: the directions in which shapes differ from their mean, found by sparse principal geodesic analysis."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
+
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
     mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
@@ -112,24 +134,42 @@ class ModeSettings(SettingsTable):
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
 
-    @property
-    def key(self) -> dict[str, Any]:
-        """The settings in the keys of stages. Runs of version 0.2 keep their keys: it had exponentials only."""
-        return self.model_dump(mode="json", exclude={"geometry"} if self.geometry == "exponential" else None)
-
 
 class FactorSettings(SettingsTable):
     """The factors: groups of modes that move the same part of the surface. Each factor has a network of its own."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"modes"})
+
     count: int | None = Field(None, ge=1)
     """Number of factors J; by default it follows from how much the modes overlap."""
+    modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
+    """The factors, if you choose them yourself: the modes of each factor, such as ``[[0, 3], [1], [2, 4]]``. Modes are
+    counted from 0, the strongest first. Every mode has to be in exactly one factor. Set ``modes.count`` too, so that
+    their number is known. By default, modes that move the same part form a factor."""
+
+    @model_validator(mode="after")
+    def _each_mode_once(self) -> FactorSettings:
+        if self.modes is None:
+            return self
+        if self.count is not None:
+            raise ValueError("give either count or modes, not both")
+        listed = [mode for factor in self.modes for mode in factor]
+        if twice := sorted({mode for mode in listed if listed.count(mode) > 1}):
+            raise ValueError(f"modes has {' and '.join(map(str, twice))} more than once; leave each mode in one factor")
+        return self
 
 
 class SampleSettings(SettingsTable):
-    """The samples to learn from: shapes of codes drawn uniformly from the hypercube, and of the collection's own
-    codes.
-    """
+    """The samples to learn from: shapes of random codes, and of the collection's own codes."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"distribution"})
+
+    distribution: Distribution = "box"
+    """How random codes are drawn. ``box``, as in the paper's experiments, is uniform within the bounds. ``ball`` is
+    uniform, in each factor, in the ellipsoid that touches the bounds. Corners of the box, where shapes fold most, then
+    have no samples. ``normal`` takes normal distributions. Their standard deviation is half of the distance from the
+    middle to the bounds, and they end at the bounds. Coordinates with a period are always uniform. Fresh codes, on
+    which the model is measured once more, are always drawn from the box."""
     count: int = Field(4000, ge=10)
     """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""
     steps: int | None = Field(None, ge=1)
@@ -177,6 +217,8 @@ def _grid(nodes: int) -> int:
 class EvaluationSettings(SettingsTable):
     """How the model is measured on the test samples."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"baselines"})
+
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
     baselines: bool = False
@@ -202,6 +244,8 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 class ExportSettings(SettingsTable):
     """Name and description of the exported bundle."""
+
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"decoder"})
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
     """Name of the model in addresses and file names."""

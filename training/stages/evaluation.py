@@ -84,10 +84,7 @@ STAGE = Stage(
     name="evaluation",
     version=2,
     # Without baselines, the digest is the same as in version 0.2, and the stage is not done again.
-    settings=lambda config: [
-        config.evaluation.model_dump(mode="json", exclude=None if config.evaluation.baselines else {"baselines"}),
-        config.export.model_dump(include={"eta_reconstruction"}),
-    ],
+    settings=lambda config: [config.evaluation, config.export.model_dump(include={"eta_reconstruction"})],
     run=measure_run,
     results=lambda run: [run.evaluation.path, run.gallery.path, run.report.path, run.exact],
     warnings=_warnings,

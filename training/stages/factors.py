@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.training.space.factors import between, group, names, overlap
+from shapespace.training.space.factors import between, given, group, names, overlap
 from shapespace.training.stages.stage import Run, Stage
 
 #: Name of the factor of a straight-line model.
@@ -14,19 +14,25 @@ WHOLE = "whole shape"
 
 def find_factors(run: Run) -> None:
     """Write ``factors.json``; of meshes also ``modes.npz``, where each factor's latents are a range, as in bundles.
-    Dense modes of straight lines are one factor. Raises FactorError if there are fewer modes than factors.
+    Dense modes of straight lines are one factor. Raises FactorError if there are fewer modes than factors, or if the
+    given factors are no partition of the modes.
     """
     directory = run.directory
     if run.by_design:
-        given = run.collection.factors
-        directory.factors.write({"factors": list(given.values()), "names": list(given)})
+        by_design = run.collection.factors
+        directory.factors.write({"factors": list(by_design.values()), "names": list(by_design)})
         return
     found, centre = directory.modes_by_strength.read(), directory.mean_mesh()
     norm = WeightedNorm.of(centre, run.config.material.eta)
     z = np.ascontiguousarray(found["nric"])  # sums round by the order in memory, and files keep that
     shared = overlap(z, norm)
-    straight = directory.straight_kind() is not None
-    groups = [list(range(len(z)))] if straight else group(shared, run.config.factors.count)
+    straight, settings = directory.straight_kind() is not None, run.config.factors
+    if straight:
+        groups = [list(range(len(z)))]
+    elif settings.modes is not None:
+        groups = given(settings.modes, len(z))
+    else:
+        groups = group(shared, settings.count)
     order = [j for members in groups for j in members]
     ordered = {name: found[name][order] for name in ("nric", "vertices", "lower", "upper", "localisation")}
     ordered |= {name: found[name][:, order] for name in ("coefficients", "mirrored_coefficients")}

@@ -204,10 +204,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="ingest",
     version=1,
-    # Only where it is given: otherwise the digest is the same as in version 0.2, and no stage is done again.
-    settings=lambda config: [
-        config.collection.model_dump(mode="json", exclude=None if config.collection.file else {"file"})
-    ],
+    settings=lambda config: [config.collection],
     run=ingest,
     results=lambda run: [
         run.reference.path,

@@ -1,7 +1,6 @@
 """Stage `mean`: the mean shape, where the tangent space is attached, and the number of time steps K."""
 
 from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
@@ -81,7 +80,7 @@ def _describe_failure(run: RunDirectory, found: Mean) -> str:
     )
 
 
-def _choice_settings(modes: ModeSettings) -> dict[str, Any]:
+def _choice_settings(modes: ModeSettings) -> ModeSettings:
     """Return ``log_steps``, or where K is chosen the number of modes by which it is chosen.
 
     Where the map from codes to shapes is chosen too, return all that decides.
@@ -89,7 +88,7 @@ def _choice_settings(modes: ModeSettings) -> dict[str, Any]:
     decide = {"log_steps"} if modes.log_steps != "auto" else {"count"}
     if modes.geometry != "exponential":
         decide = {"geometry", "count", "log_steps", "norm"}
-    return ModeSettings(**modes.model_dump(include=decide)).key
+    return ModeSettings(**modes.model_dump(include=decide))
 
 
 STAGE = Stage(

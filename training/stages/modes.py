@@ -152,7 +152,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="modes",
     version=2,
-    settings=lambda config: [config.modes.key],
+    settings=lambda config: [config.modes],
     run=decompose,
     results=lambda run: [run.modes_by_strength.path, run.modes.path, run.decomposition.path],
     warnings=_warnings,

@@ -62,8 +62,9 @@ def _settings(config: Config) -> list[BaseModel | dict[str, Any]]:
     row: dict[str, Any] = {"title": "", "base": None, "factors": {}, "combiner": {}}
     variants = config.model_dump(mode="json")["variants"].values()
     asked = [{"baselines": True}] if config.evaluation.baselines else []
+    networks = config.networks.model_dump(mode="json", exclude={"device"})
     rows = (row | variant for variant in variants)
-    return [config.networks, config.monolithic, config.monolithic_paper, *rows, *asked]
+    return [networks, config.monolithic, config.monolithic_paper, *rows, *asked]
 
 
 # A network's file is named by a digest of all that the network depends on. So a change of settings keeps the networks

@@ -142,6 +142,8 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
+        if "seconds" not in directory.stamp("networks").read_if_written():
+            import_module("shapespace.training.learning.device").training_device(run.config.networks.device)
     done = False
     for name, stage in STAGES.items():
         stamp = directory.stamp(name).read_if_written()

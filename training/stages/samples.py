@@ -30,10 +30,10 @@ def draw_samples(run: Run) -> None:
     settings, coordinates = run.config.samples, run.collection.coordinates
     directory, folder = run.directory, run.directory.samples
     code_rng, split_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(settings.seed).spawn(2))
-    straight = directory.straight_kind()
+    straight, factors = directory.straight_kind(), run.collection.factors.values()
     count = min(settings.count, STRAIGHT_SAMPLES) if straight else settings.count
-    own = [] if straight else settings.own(len(run.collection.factors))
-    codes = coordinates.uniform(max([count, *own]), code_rng)
+    own = [] if straight else settings.own(len(factors))
+    codes = coordinates.drawn(settings.distribution, factors, max([count, *own]), code_rng)
     run.draw(folder, codes[:count], "joint samples", shorten=True)
     known = run.collection.codes
     if wanted := 0 if straight else min(len(known), count // 4) * settings.shapes:

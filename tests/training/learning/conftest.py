@@ -7,6 +7,9 @@ import trimesh
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling
+from tests.training.learning.fake_device import fake_device
+
+__all__ = ["fake_device"]
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from shapespace.bundle.schema import COMBINER
-from shapespace.coordinates.nric import nric
+from shapespace.coordinates.nric import NRICJacobian, nric
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.torch.networks import TorchNetwork
 from shapespace.training.learning.combiners import kernels
@@ -27,7 +27,7 @@ from shapespace.training.learning.combiners.convolutions import (
     Star,
     flaps,
 )
-from shapespace.training.learning.combiners.correction import JointSamples, Slopes
+from shapespace.training.learning.combiners.correction import JointSamples, Slopes, SurfaceGaps
 from shapespace.training.learning.combiners.kernels import KernelCorrection
 from shapespace.training.learning.combiners.patches import LEARNING, _updated, learned_metric
 from shapespace.training.learning.composite import affine_sum
@@ -36,7 +36,7 @@ from shapespace.training.learning.fitting import read_network, save_network
 from shapespace.training.runs.network_settings import (
     AutoSettings,
     ConvolutionSettings,
-    FieldSettings,
+    DenseSettings,
     KernelSettings,
     PaperSettings,
     ProductSettings,
@@ -221,7 +221,9 @@ def test_derivatives_teach_a_correction(ball: TriangleMesh) -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [settings for settings, _, _ in KINDS] + [PaperSettings(width=4), AutoSettings()], ids=lambda s: s.kind
+    "settings",
+    [settings for settings, _, _ in KINDS] + [PaperSettings(width=4), AutoSettings(), DenseSettings(hidden=[4])],
+    ids=lambda s: s.kind,
 )
 def test_every_correction_comes_back_from_its_file(ball: TriangleMesh, settings: Any, tmp_path: Path) -> None:
     x, z = interplay(ball, 60, cubic)
@@ -254,7 +256,7 @@ def test_every_correction_runs_in_pytorch_from_its_onnx_file(ball: TriangleMesh,
 
 
 def test_every_kind_has_a_class() -> None:
-    assert {settings.kind for settings, _, _ in KINDS} | {FieldSettings().kind} == set(CORRECTIONS)
+    assert {settings.kind for settings, _, _ in KINDS} | {"field", "dense", "sum"} == set(CORRECTIONS)
     assert {settings.kind for settings in choices(AutoSettings())} <= set(CORRECTIONS)
     paper = PaperSettings().convolutions
     assert (paper.neighbourhood, paper.residual, paper.dropout, paper.edge_channels) == ("star", False, 0.1, 0)
@@ -373,3 +375,56 @@ def test_a_learned_metric_finds_the_direction_that_matters() -> None:
     value, vector = torch.linalg.eigh(metric @ metric.T)
     assert (vector[:, -1] @ direction).abs() > 0.999
     assert value[-1] > 20 * value[-2]
+
+
+def test_a_dense_combiner_begins_as_the_affine_sum_or_as_nothing(ball: TriangleMesh) -> None:
+    x, z = interplay(ball, 20, bilinear)
+    residual, whole = (
+        fitted(ball, DenseSettings(hidden=[4], residual=residual), x, z, 15) for residual in (True, False)
+    )
+    with torch.no_grad():
+        sums = affine_sum(residual.scaling.mean.numpy(), x.numpy())
+        np.testing.assert_allclose(residual(x).numpy(), sums, atol=2e-5)
+        assert np.abs(whole(x).numpy() - sums).max() > 1e-3
+
+
+@pytest.mark.parametrize("order", ["before", "after", "none"])
+def test_convolutions_normalise_before_or_after_their_activation(ball: TriangleMesh, order: str) -> None:
+    x, z = interplay(ball, 20, bilinear)
+    torch.manual_seed(0)
+    settings = PaperSettings(width=4, layers=2, normalisation=order)
+    correction = fitted(ball, settings, x, z, 15).correction.train()
+    assert isinstance(correction, ConvolutionCorrection)
+    correction.dropout.p, seen = 0.0, []
+    correction.readout.register_forward_hook(lambda layer, inputs, output: seen.append(inputs[0].flatten(0, 1)))
+    correction(torch.randn(8, *x.shape[1:]))
+    means, spreads = seen[0].mean(dim=0), seen[0].std(dim=0)
+    assert (means.abs().max() < 1e-4) == (order == "after")
+    assert (abs(spreads - 1).max() < 0.05) == (order == "after")
+    assert len(correction.state_dict().keys() & {"norms.0.weight"}) == (order != "none")
+
+
+def test_gaps_of_lengths_and_angles_count_and_changes_of_surfaces_do_not(ball: TriangleMesh) -> None:
+    rng, rest = np.random.default_rng(0), nric(ball.vertices, ball.connectivity)
+    scale = scaling(ball, noisy(ball, 30))
+    tangents = NRICJacobian(ball.connectivity)(ball.vertices) @ rng.normal(size=(3 * len(ball.vertices), 10))
+    gaps = SurfaceGaps(3.0, ball, scale)
+    surface = scale.down(torch.from_numpy(rest + 0.01 * tangents.T).float())
+    torn = torch.from_numpy(rng.normal(size=(200, len(rest)))).float()
+    assert gaps(surface) < 1e-4 * surface.square().mean()
+    assert float(gaps(torn) / torn.square().mean()) == pytest.approx(3, rel=0.1)
+    assert not gaps.state_dict(), "no part of the model"
+
+
+@pytest.mark.parametrize("kind", [DenseSettings, PaperSettings], ids=lambda kind: kind.__name__)
+def test_a_combiner_is_trained_with_the_penalty(ball: TriangleMesh, kind: Any) -> None:
+    x, z = interplay(ball, 20, bilinear)
+    torch.manual_seed(0)
+    network = fitted(ball, kind(integrability=5.0), x, z, 15)
+    missed = network.coefficients(x) - network.target(z)
+    penalty = SurfaceGaps(5.0, ball, network.scaling)(missed)
+    assert penalty > 0.1 * missed.square().mean()
+    torch.testing.assert_close(network.loss(x, network.target(z)), missed.square().mean() + penalty)
+    assert network.error(network.coefficients(x), network.target(z)) == missed.square().mean(), (
+        "epochs are compared without"
+    )

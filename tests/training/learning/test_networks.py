@@ -9,7 +9,7 @@ from shapespace.coordinates.nric import NRICJacobian, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.latent_features import FourierProducts, LatentFeatures, Polynomials, affordable_degree
-from shapespace.training.learning.layers import PatchBasis, Scaling
+from shapespace.training.learning.layers import PatchBasis, Scaling, perceptron
 from shapespace.training.learning.networks import FactorNetwork
 from shapespace.training.runs.latent_coordinates import Coordinates
 from shapespace.training.runs.network_settings import LatentNetworkSettings
@@ -184,3 +184,15 @@ def test_the_fitted_skip_layer_reproduces_a_trigonometric_polynomial(ball: Trian
     with torch.no_grad():
         network.fit_skip(latent, network.target(target), (latent[:50], network.target(target[:50])))
         assert (network(latent) - target).abs().max() < 1e-4
+
+
+def test_a_hidden_layer_normalises_before_or_after_its_activation() -> None:
+    torch.manual_seed(0)
+    x = torch.randn(200, 3)
+    after, before, plain = (perceptron([3, 5, 2], order)[:-1](x).detach() for order in ("after", "before", "none"))
+    assert after.mean(dim=0).abs().max() < 1e-5
+    torch.testing.assert_close(after.std(dim=0), torch.ones(5), atol=0.05, rtol=0)
+    assert before.mean(dim=0).min() > 0.05, "ELU raises the mean of normalised values"
+    assert not any(isinstance(layer, torch.nn.BatchNorm1d) for layer in perceptron([3, 5, 2], "none"))
+    assert plain.std(dim=0).max() < 0.9
+    assert sum(isinstance(layer, torch.nn.Dropout) for layer in perceptron([3, 5, 4, 2], "after", 0.1)) == 2

@@ -33,6 +33,11 @@ def test_every_example_is_a_configuration_and_what_is_kept_of_it_says_the_same(p
         ("products = 2", "cofficients = 2", "networks.combiner.correction.convolutions.cofficients"),
         ('kind = "convolutions"', 'kind = "kernels"', "networks.combiner.correction"),
         ("products = 2", "products = 2\nresidual = false", "products need residual"),
+        ("products = 2", "crop = 60\nintegrability = 1", "integrability needs whole shapes"),
+        ("[export]", "[factors]\nmodes = [[0, 1], [1]]\n[export]", "modes has 1 more than once"),
+        ("[export]", "[factors]\nmodes = [[0], []]\n[export]", "factors.modes.1"),
+        ("[export]", "[factors]\nmodes = [[0, -1]]\n[export]", "factors.modes.0.1"),
+        ("[export]", "[factors]\ncount = 2\nmodes = [[0]]\n[export]", "either count or modes"),
     ],
 )
 def test_a_faulty_setting_is_named(old: str, new: str, says: str) -> None:
@@ -121,3 +126,21 @@ def test_a_run_of_version_0_2_keeps_the_papers_first_step_and_a_new_one_names_it
     assert (asked.exponential.first_step, text) == ("centred", mine.read_text())
     assert stage_keys(old, "")["ingest"] == stage_keys(asked, "")["ingest"]
     assert stage_keys(old, "")["mean"] != stage_keys(asked, "")["mean"]
+
+
+def test_new_settings_are_dumped_only_where_they_are_set() -> None:
+    """So stages and networks of version 0.2, which are named by digests of dumps, keep their names."""
+    usual, changed = (
+        parse(TINY, "a.toml"),
+        parse(TINY.replace("count = 60", 'count = 60\ndistribution = "ball"'), "a.toml"),
+    )
+    assert "distribution" not in usual.samples.model_dump()
+    assert changed.samples.model_dump()["distribution"] == "ball"
+    assert Config.model_validate(changed.model_dump(mode="json", by_alias=True)) == changed
+
+
+def test_the_device_is_in_no_key() -> None:
+    """Its results differ in rounding only, so a change of the device repeats no stage."""
+    on_processor = TINY.replace("[networks.combiner", '[networks]\ndevice = "cpu"\n\n[networks.combiner')
+    one, other = (stage_keys(parse(text, "here"), "data") for text in (TINY, on_processor))
+    assert one == other

@@ -7,7 +7,7 @@ import trimesh
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.space.factors import FactorError, between, group, names, overlap
+from shapespace.training.space.factors import FactorError, between, given, group, names, overlap
 
 #: Which of three regions each of seven modes moves.
 REGIONS = [1, 0, 1, 2, 0, 1, 2]
@@ -125,3 +125,20 @@ def test_names_know_every_side_but_not_of_a_thin_axis(norm, mesh):
     assert names([[0], [1]], nric, norm, mesh) == ["lower right", "middle"]
     deep = mesh.with_vertices(mesh.vertices * [1, 1, 2])
     assert names([[0], [1]], nric, norm, deep) == ["lower right", "back"]
+
+
+def test_given_factors_stay_in_their_order():
+    assert given([[2, 0], [1]], 3) == [[2, 0], [1]]
+
+
+@pytest.mark.parametrize(
+    ("factors", "says"),
+    [
+        ([[0, 1], [3]], "there is no mode 3; these modes are in no factor: 2"),
+        ([[0, 1, 2], [1]], "listed more than once: 1"),
+        ([[5, 4, 3]], "no mode 3, 4, 5; these modes are in no factor: 0, 1, 2. There are 3 modes, counted from 0 to 2"),
+    ],
+)
+def test_given_factors_that_are_no_partition_are_refused(factors, says):
+    with pytest.raises(FactorError, match=says):
+        given(factors, 3)

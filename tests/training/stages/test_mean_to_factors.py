@@ -76,3 +76,9 @@ def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     away = np.abs(align(found.shapes(code[None]).vertices[0], straight) - straight).max()
     assert away < 1e-12 if steps == 1 else away > 1e-4
     assert (found.limit is None) == (steps == 1), "one step approximates no geodesic"
+
+    source += "[factors]\nmodes = [[2, 5, 7], [1, 0], [3, 4, 6]]\n"
+    run = Run(tmp_path, parse(source, "balls.toml"), source, tmp_path / "models")
+    STAGES["factors"].run(run)
+    assert run.directory.factors.read()["factors"] == [[0, 1, 2], [3, 4], [5, 6, 7]]
+    assert run.directory.modes.read()["rank"].tolist() == [2, 5, 7, 1, 0, 3, 4, 6]

@@ -17,7 +17,7 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.network_settings import ProductSettings, Recipe
+from shapespace.training.runs.network_settings import FitSettings, ProductSettings, Recipe
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY
@@ -68,20 +68,20 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
     assert served.average(folds, "components") == "2.000\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}10.000"
 
 
-def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run) -> None:
     """The main networks, in the place of the paper's that take hours, reach again what they have reached."""
-    before = copy.directory.evaluation.read()
-    monkeypatch.setattr(Learner, "paper", Learner.main)
+    before, systems = copy.directory.evaluation.read(), dict.fromkeys(paper.SYSTEMS, copy.config.networks)
     after = deepcopy(before)
-    paper.measure(copy, after)
+    paper.measure(copy, after, systems)
     for old, new in ((before, after), (before["fresh"], after["fresh"])):
-        assert new["r2"]["paper"] == pytest.approx(old["r2"]["composite"], abs=1e-6)
+        for system in systems:
+            assert new["r2"][system] == pytest.approx(old["r2"]["composite"], abs=1e-6)
     bundled.add_paper(before, after)
     assert before["fresh"]["r2"]["paper"] == after["fresh"]["r2"]["paper"]
 
     before["fresh"]["seed"] += 1
     with pytest.raises(paper.OtherSamplesError, match="the kernel has"):
-        paper.measure(copy, before)
+        paper.measure(copy, before, systems)
 
 
 def r2(learner: Learner, model: Model, part: str) -> float:
@@ -121,6 +121,19 @@ def test_studies_add_their_figures_and_networks_to_a_finished_run(copy: Run) -> 
         assert said["total"] == pytest.approx(found, abs=1e-6)
     assert other.split["test"].tolist() != learner.split["test"].tolist()
     assert {path.stem: path.read_bytes() for path in directory.networks()} == networks, "learned again"
+
+
+def test_all_networks_are_tuned_together_once(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, settings = learner_of(copy), copy.config.networks
+    tuned = settings.model_copy(update={"fine_tuning": FitSettings(max_epochs=2, batch_size=8)})
+    first, plain = learner.composite(tuned), learner.main()
+    assert sum(name.startswith("joint-") for name in learner.histories) == 1
+    codes = torch.as_tensor(learner.joint.latents[:3], dtype=torch.float32)
+    monkeypatch.setattr(Learner, "joint", None)  # samples are not needed any more
+    again = learner_of(copy).composite(tuned)
+    with torch.no_grad():
+        assert torch.equal(first(codes), again(codes))
+        assert not torch.equal(first(codes), plain(codes))
 
 
 def test_every_run_of_the_pages_has_valid_studies() -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.combiners.convolutions import ConvolutionCorrection
 from shapespace.training.learning.combiners.correction import Correction, JointSamples
+from shapespace.training.learning.combiners.dense import DenseCorrection
 from shapespace.training.learning.combiners.fields import FieldCorrection
 from shapespace.training.learning.combiners.kernels import KernelCorrection
 from shapespace.training.learning.combiners.products import ProductCorrection
@@ -38,6 +39,7 @@ CORRECTIONS: dict[str, type[Correction]] = {
     "products": ProductCorrection,
     "sum": SumCorrection,
     "convolutions": ConvolutionCorrection,
+    "dense": DenseCorrection,
     "field": FieldCorrection,
 }
 

@@ -20,7 +20,7 @@ from shapespace.training.runs.network_settings import ConvolutionSettings, FitSe
 
 
 class ConvolutionCorrection(Correction):
-    """Graph convolutions on edges, each followed by batch normalisation, ELU and dropout.
+    """Graph convolutions on edges, each followed by batch normalisation and ELU in some order, and dropout.
 
     With ``residual`` they correct the affine sum, or its correction by products, and start at zero. Without
     ``residual`` they put out the joint shape itself, as in the paper. Features of an edge are the lengths and angles of
@@ -46,7 +46,8 @@ class ConvolutionCorrection(Correction):
         widths = [2 * factor_count + 2 + settings.edge_channels] + [settings.width] * settings.layers
         around = Star(connectivity) if settings.neighbourhood == "star" else Flaps(connectivity)
         self.convolutions = nn.ModuleList(EdgeConvolution(around, a, b) for a, b in itertools.pairwise(widths))
-        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for width in widths[1:])
+        norms = (nn.Identity() if settings.normalisation == "none" else nn.BatchNorm1d(width) for width in widths[1:])
+        self.norms = nn.ModuleList(norms)
         self.dropout = nn.Dropout(settings.dropout)
         self.readout = nn.Linear(widths[-1], 2)
         if settings.residual:
@@ -67,7 +68,9 @@ class ConvolutionCorrection(Correction):
         if settings.products:
             how = ProductSettings(coefficients=settings.products)
             products = ProductCorrection.fit(how, reference, own, held_out, seed)
-        return cls(settings, reference, own.rest, own.factors.shape[1], products)
+        result = cls(settings, reference, own.rest, own.factors.shape[1], products)
+        result.penalise_gaps(settings.integrability, reference, own.scaling)
+        return result
 
     @classmethod
     def load(
@@ -114,8 +117,10 @@ class ConvolutionCorrection(Correction):
     def _layers(self, x: Tensor, neighbours: Tensor | None = None) -> Tensor:
         """Map features (E, n, C) of edges to outputs (E, n, 2)."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
-            new = norm(convolution(x, neighbours).flatten(0, 1))
-            new = self.dropout(nn.functional.elu(new)).view(*x.shape[:2], -1)
+            new = convolution(x, neighbours).flatten(0, 1)
+            late = self.settings.normalisation == "after"
+            new = norm(nn.functional.elu(new)) if late else nn.functional.elu(norm(new))
+            new = self.dropout(new).view(*x.shape[:2], -1)
             x = x + new if self.settings.residual and x.shape == new.shape else new
         return self.readout(x)
 

@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from shapespace.coordinates.integrability import Integrability
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.runs.network_settings import FitSettings
@@ -89,6 +91,7 @@ class Correction(nn.Module, ABC):
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         super().__init__()
+        self.gaps: SurfaceGaps | None = None
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor)
 
@@ -114,6 +117,43 @@ class Correction(nn.Module, ABC):
     def forward(self, y: Tensor) -> Tensor:
         return y.sum(dim=1) + self.difference(y)
 
+    def penalise_gaps(self, weight: float, reference: TriangleMesh, scaling: Scaling) -> None:
+        """Add a penalty to the loss on whole shapes, for training only. Without a weight, do nothing."""
+        if weight:
+            self.gaps = SurfaceGaps(weight, reference, scaling)
+
     def loss(self, y: Tensor, target: Tensor) -> Tensor:
-        """Return the mean square error, or an estimate of it, for training."""
-        return nn.functional.mse_loss(self(y), target)
+        """Return the mean square error, or an estimate of it, for training, with the penalty if there is one."""
+        missed = self(y) - target
+        error = missed.square().mean()
+        return error if self.gaps is None else error + self.gaps(missed)
+
+
+class SurfaceGaps(nn.Module):
+    """Penalty for errors (n, 2E) of scaled differences that are not the change of any surface.
+
+    Such lengths and angles leave a gap between the first and the last face around a vertex. The penalty is the mean
+    square of the gaps, linearised at the reference. Its scale is such that errors which are equal in all directions
+    have ``weight`` times their mean square as penalty.
+    """
+
+    rows: Tensor
+    columns: Tensor
+    values: Tensor
+
+    def __init__(self, weight: float, reference: TriangleMesh, scaling: Scaling) -> None:
+        super().__init__()
+        closing = Integrability(reference.connectivity).jacobian(scaling.mean.double().numpy())
+        change = (closing * scaling.inverse.double().numpy()[None]).tocoo()
+        values = torch.as_tensor(change.data) * (weight / max(np.square(change.data).sum(), 1e-30)) ** 0.5
+        self.count = closing.shape[0]
+        # No part of the model: bundles and files of networks do not have it.
+        self.register_buffer("rows", torch.as_tensor(change.row, dtype=torch.long), persistent=False)
+        self.register_buffer("columns", torch.as_tensor(change.col, dtype=torch.long), persistent=False)
+        self.register_buffer("values", values.float(), persistent=False)
+
+    def forward(self, missed: Tensor) -> Tensor:
+        """Return the mean penalty of errors (n, 2E)."""
+        gaps = missed.new_zeros(self.count, len(missed))
+        gaps = gaps.index_add(0, self.rows, (missed[:, self.columns] * self.values).T)
+        return gaps.square().sum() / len(missed)

@@ -45,17 +45,20 @@ class Crops:
 
     def about(self, centres: Tensor) -> Crop:
         """Return the crops around edges (n,)."""
+        device = centres.device
+        self._nearest, self._neighbours = self._nearest.to(device), self._neighbours.to(device)  # moved at most once
         edges = self._nearest[centres]
         (n, size), neighbours = edges.shape, self._neighbours[edges]
-        place = torch.full((n, len(self._neighbours) + 1), -1)
-        place.scatter_(1, edges, torch.arange(size).expand(n, -1))
+        place = torch.full((n, len(self._neighbours) + 1), -1, device=device)
+        place.scatter_(1, edges, torch.arange(size, device=device).expand(n, -1))
         # Positions (n, K, k) of neighbours in the crops, −1 outside.
         local = place.gather(1, neighbours.flatten(1)).view_as(neighbours)
-        graph = torch.where(local < 0, n * size, local + size * torch.arange(n)[:, None, None]).flatten(0, 1)
+        first = size * torch.arange(n, device=device)[:, None, None]
+        graph = torch.where(local < 0, n * size, local + first).flatten(0, 1)
         # An edge is an inner edge if no path with one step for each layer leads out of the crop.
         inner = ~((local < 0) & (neighbours < len(self._neighbours))).any(dim=2)
         for _ in range(self._layers - 1):
-            known = torch.cat([inner.flatten(), torch.ones(1, dtype=torch.bool)])
+            known = torch.cat([inner.flatten(), torch.ones(1, dtype=torch.bool, device=device)])
             inner = inner & known[graph].all(dim=1).view_as(inner)
         return Crop(edges, graph, inner)
 
