@@ -117,8 +117,8 @@ class Animation(Body):
         if not self.examples:
             return False
         path = self._segments(latents, which)
-        ends = (latents.codes(codes.tolist())[0] for codes in (path.first, path.last))
-        return Fade(*ends, path.share)
+        first, last = (latents.codes(ends.tolist())[0] for ends in (path.first, path.last))
+        return Fade(first, last, path.share)
 
     def _segments(self, latents: LatentSpace, which: slice) -> Fade:
         keyframes = latents.codes(self.keyframes)[0].astype(np.float64)

@@ -175,7 +175,7 @@ class Decoder:
         """Decode codes (n, m) one after another; see `shape`, `batches`, and `Examples`."""
         for some in self.batches(codes, quality):
             began = time.perf_counter()
-            targets = self._targets(codes[some], examples if isinstance(examples, bool) else examples[some])
+            targets = self.targets(codes[some], examples if isinstance(examples, bool) else examples[some])
             seconds = (time.perf_counter() - began) / len(targets)
             for code, target, inside in zip(codes[some], targets, inside_bounds[some], strict=True):
                 yield self._solved(code, target, bool(inside), mesh, deadline, quality, seconds)
@@ -310,7 +310,7 @@ class Decoder:
         fine = self.finer(mesh)
         return fine.nearby if fine else np.ones(len(self.reference.vertices))
 
-    def _targets(self, codes: Codes, examples: Examples) -> FloatArray:
+    def targets(self, codes: Codes, examples: Examples) -> FloatArray:
         """Return combined NRIC (n, 2E), with the memory of training shapes as wanted."""
         if isinstance(examples, Fade):
             if self.remembers:

@@ -26,8 +26,8 @@ _PLACES, _WEIGHTS = "places", "weights"
 class Fade:
     """Segments on which frames (n,) lie: their ends (n, m), and the position of each frame, 0 at the first end."""
 
-    first: Codes
-    last: Codes
+    first: NDArray[np.floating]
+    last: NDArray[np.floating]
     share: FloatArray
 
     def __getitem__(self, some: slice) -> Fade:

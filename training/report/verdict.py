@@ -68,8 +68,8 @@ def advice(record: Record) -> Iterator[str]:
     if shapes and trained.get("mean", own) < LEARNED * own:
         missed = percent(trained["mean"])
         yield (
-            f"More shapes: the modes miss the {shapes} training shapes by {missed}, and unseen shapes by {percent(own)}. "
-            "Add shapes that differ from yours."
+            f"More shapes: the modes miss the {shapes} training shapes by {missed}, and unseen shapes by "
+            f"{percent(own)}. Add shapes that differ from yours."
         )
 
 
