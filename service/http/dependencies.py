@@ -85,6 +85,11 @@ QualityQuery = Annotated[
         "`draft` omits Gauss–Newton if the first guess is accurate enough.",
     ),
 ]
+_EXAMPLES = "`false` leaves out what the model remembers of training shapes."
+ExamplesQuery = Annotated[bool, Query(alias="examples", description=_EXAMPLES)]
+ExamplesOfBody = Annotated[
+    bool | None, Query(alias="examples", description=f"Overrides `examples` in the body: {_EXAMPLES}")
+]
 QualityOfBody = Annotated[
     Quality | None, Query(alias="quality", description="Overrides `quality` in the body: `auto`, `full` or `draft`.")
 ]

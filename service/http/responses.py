@@ -13,6 +13,7 @@ from starlette.types import Receive, Scope, Send
 
 from shapespace.mesh.attributes import Topology
 from shapespace.model.latent_space import CheckedCode
+from shapespace.model.memory import Examples
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
@@ -86,20 +87,24 @@ async def shape_response(
             headers["Shape-Color"] = dump_json(found.legend).decode()
         return CachedAnswer(found.content, headers), found.seconds
 
-    options = tag_options(wanted.quality, wanted.colour_by, wanted.topology)
+    options = tag_options(wanted.quality, wanted.colour_by, wanted.topology, wanted.examples)
     if place := wanted.place:
         options += ["place", *(np.asarray(part).tobytes() for part in (place.rotation, place.translation, place.scale))]
     tag = entity_tag("shape", model.digest, _code_bytes(wanted.code), wanted.mesh, wanted.format, *options)
     return await cached_response(service, request, tag, SHAPE_FORMATS[wanted.format].media_type, compute)
 
 
-def tag_options(quality: Quality, colour_by: ColourOptions | None, topology: Topology) -> list[str | bytes]:
+def tag_options(
+    quality: Quality, colour_by: ColourOptions | None, topology: Topology, examples: Examples = True
+) -> list[str | bytes]:
     """Return the parts of an entity tag that distinguish options of the same shapes; none for the defaults."""
     options: list[str | bytes] = [] if quality is Quality.FULL else [quality]
     if colour_by:
         covariance = colour_by.covariance
         against = _code_bytes(colour_by.against) if covariance is None else covariance.tobytes()
         options += [colour_by.quantity, against]
+    if examples is not True:
+        options += ["examples", bytes(examples) if examples else b""]
     return options if topology is Topology.ORIGINAL else [*options, topology]
 
 

@@ -16,6 +16,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator, model_
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import LatentSpace
+from shapespace.model.memory import Examples, Fade
 from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
@@ -68,6 +69,12 @@ class Animation(Body):
         description="Append the first keyframe and drop the last frame, so that the animation repeats without a jump.",
     )
     mesh: MeshChoice = Field(MeshChoice.FINE, description="The mesh of the frames, fine or coarse.")
+    examples: bool = Field(
+        True,
+        strict=True,
+        description="Whether keyframes reproduce training shapes exactly. Between two keyframes, their corrections "
+        "fade in proportion to the position, so the speed stays even. `false` leaves out stored training shapes.",
+    )
     name: str | None = Field(
         None, min_length=1, max_length=60, description="Name of the animation in GLB files, `animation` by default."
     )
@@ -99,6 +106,21 @@ class Animation(Body):
 
     def codes(self, latents: LatentSpace, which: slice = slice(None)) -> list[list[float]]:
         """Return the codes (n, m) of all or some frames, periodic coordinates not reduced; raises LatentError."""
+        path = self._segments(latents, which)
+        share = path.share[:, None]
+        # This form gives both keyframes exactly, at share 0 and 1.
+        codes: list[list[float]] = ((1 - share) * path.first + share * path.last).tolist()
+        return codes
+
+    def memory(self, latents: LatentSpace, which: slice = slice(None)) -> Examples:
+        """Return the memory of training shapes for all or some frames; raises LatentError."""
+        if not self.examples:
+            return False
+        path = self._segments(latents, which)
+        first, last = (latents.codes(ends.tolist())[0] for ends in (path.first, path.last))
+        return Fade(first, last, path.share)
+
+    def _segments(self, latents: LatentSpace, which: slice) -> Fade:
         keyframes = latents.codes(self.keyframes)[0].astype(np.float64)
         knots = np.arange(len(keyframes), dtype=np.float64) if self.times is None else np.array(self.times)
         if self.loop:
@@ -107,10 +129,8 @@ class Animation(Body):
         keyframes = latents.unroll(keyframes)
         t = knots[0] + self.positions[which] * (knots[-1] - knots[0])
         segment = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
-        share = ((t - knots[segment]) / (knots[segment + 1] - knots[segment]))[:, None]
-        # This form gives both keyframes exactly, at share 0 and 1.
-        codes: list[list[float]] = ((1 - share) * keyframes[segment] + share * keyframes[segment + 1]).tolist()
-        return codes
+        share = (t - knots[segment]) / (knots[segment + 1] - knots[segment])
+        return Fade(keyframes[segment], keyframes[segment + 1], share)
 
     def to_id(self, model_digest: str, latents: LatentSpace) -> str:
         """Return an id that holds the whole animation, so that any replica can answer it at any time.
@@ -125,6 +145,8 @@ class Animation(Body):
         if len(self.keyframes) + sum(map(len, self.keyframes)) > ID_VALUES:
             raise too_long  # before computing anything from them
         content = self.model_dump(mode="json", exclude_none=True)
+        if self.examples:  # ids of version 0.2 stay the same
+            del content["examples"]
         content["keyframes"] = latents.codes(self.keyframes)[0]
         content["model"] = model_digest[:DIGEST_DIGITS]
         payload = orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_SORT_KEYS)

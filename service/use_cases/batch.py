@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shapespace.files.archives import Buffer
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import CheckedCode, Codes
+from shapespace.model.memory import Examples
 from shapespace.model.shape import Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
@@ -120,10 +121,16 @@ async def batch(workers: Workers, caller: Caller, size: int) -> AsyncIterator[Ba
 
 
 def solve(
-    workers: Workers, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, deadline: Deadline
+    workers: Workers,
+    model: ShapeModel,
+    mesh: MeshChoice,
+    quality: Quality,
+    code: CheckedCode,
+    deadline: Deadline,
+    examples: Examples = True,
 ) -> Shape:
     """Return the shape of a code; raises DeadlineError."""
-    return next(solve_all(workers, model, mesh, quality, (code[0][None], np.array([code[1]])), deadline))
+    return next(solve_all(workers, model, mesh, quality, (code[0][None], np.array([code[1]])), deadline, examples))
 
 
 def solve_all(
@@ -133,9 +140,10 @@ def solve_all(
     quality: Quality,
     codes: tuple[Codes, NDArray[np.bool_]],
     deadline: Deadline,
+    examples: Examples = True,
 ) -> Iterator[Shape]:
     """Yield the shapes of codes (n, m), with (n,) whether each is inside the bounds; raises DeadlineError."""
-    found = model.decoder.shapes(*codes, mesh, deadline, quality)
+    found = model.decoder.shapes(*codes, mesh, deadline, quality, examples)
     while True:
         with OneBlasThread():
             shape = next(found, None)

@@ -20,6 +20,7 @@ from shapespace.model.blend_shapes import blend_shapes, require_ends
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, Codes
+from shapespace.model.memory import Examples
 from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, Workers
@@ -184,16 +185,19 @@ async def shapes(
     quality: Quality,
     *,
     apart: bool = False,
+    examples: Examples = True,
 ) -> ShapeBatch:
     """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``.
 
-    Networks run for several codes at once, which changes the last digits, or for each code ``apart``.
+    Networks run for several codes at once, which changes the last digits, or for each code ``apart``. ``examples`` is
+    the memory of training shapes.
     """
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
     def find(some: slice, call: Call) -> list[tuple[Diagnostics, Timings]]:
         found = []
-        solved = solve_all(work.workers, model, mesh, quality, (codes[some], inside[some]), call)
+        own = examples if isinstance(examples, bool) else examples[some]
+        solved = solve_all(work.workers, model, mesh, quality, (codes[some], inside[some]), call, own)
         for k, shape in enumerate(solved, some.start):
             vertices[k] = shape.vertices
             found.append((shape.diagnostics, shape.seconds))

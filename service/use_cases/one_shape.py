@@ -16,6 +16,7 @@ from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
+from shapespace.model.memory import Examples
 from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import vertex_uncertainty
@@ -50,6 +51,7 @@ class ShapeRequest:
     colour_by: ColourOptions | None = None
     place: Placement | None = None
     topology: Topology = Topology.ORIGINAL
+    examples: Examples = True
 
 
 @dataclass(frozen=True)
@@ -78,18 +80,18 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
     """Return one shape as a file; raises NotFiniteError or ModelFailedError if the model has none for the code."""
     mesh, colour_by = wanted.mesh, wanted.colour_by
 
-    def find(code: CheckedCode | None, deadline: Deadline) -> Shape:
+    def find(code: CheckedCode | None, deadline: Deadline, examples: Examples) -> Shape:
         if code is None:
             return model.decoder.reference_shape(mesh)
-        return solve(workers, model, mesh, wanted.quality, code, deadline)
+        return solve(workers, model, mesh, wanted.quality, code, deadline, examples)
 
     def make(deadline: Deadline) -> ShapeFile:
-        found, colouring = [find(wanted.code, deadline)], None
+        found, colouring = [find(wanted.code, deadline, wanted.examples)], None
         if colour_by and wanted.code and colour_by.covariance is not None:
             spread = vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, deadline)
             colouring = Colouring.of_spread(spread)
         elif colour_by:
-            found.append(find(colour_by.against, deadline))
+            found.append(find(colour_by.against, deadline, bool(wanted.examples)))
         began = time.perf_counter()
         if colour_by and colouring is None:
             vertices, against = (shape.vertices for shape in found)

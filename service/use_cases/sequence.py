@@ -16,6 +16,7 @@ from shapespace.files.archives import Buffer
 from shapespace.files.colouring import Colouring
 from shapespace.mesh.attributes import Topology
 from shapespace.model.latent_space import CheckedCode
+from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Caller, Workers
@@ -65,6 +66,13 @@ def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
     return model.latents.code(animation.codes(model.latents, slice(k, k + 1))[0])
 
 
+def frame_memory(model: ShapeModel, animation: Animation, k: int) -> Examples:
+    """Return the memory of training shapes for one frame. A keyframe has the memory of its code alone."""
+    memory = animation.memory(model.latents, slice(k, k + 1))
+    alone = not model.decoder.remembers or (isinstance(memory, Fade) and memory.share[0] in {0, 1})
+    return True if alone else memory
+
+
 async def sequence_file(
     workers: Workers,
     caller: Caller,
@@ -78,15 +86,17 @@ async def sequence_file(
 ) -> EncodedFile:
     """Return all frames as one file in a format of SEQUENCE_FORMATS; raises TooManyCodesError or NoRoomError."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
+    memory = animation.memory(model.latents)
     number, mesh = len(codes), animation.mesh
     if colour_by and colour_by.against is not None:  # computed as one more shape, the last
         code, within = colour_by.against
         codes, inside = np.concatenate([codes, code[None]]), np.append(inside, within)
+        memory = memory.followed_by(code) if isinstance(memory, Fade) else memory
     # Colours take as much memory as positions.
     caller = replace(caller, long=True)
     async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         # A frame has the same bytes alone and in the whole animation.
-        found = await shapes(work, model, codes, inside, mesh, quality, apart=True)
+        found = await shapes(work, model, codes, inside, mesh, quality, apart=True, examples=memory)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
         surface = with_topology(model.decoder.surface(mesh), topology)
 
@@ -110,12 +120,13 @@ async def sequence_lines(
 ) -> AsyncGenerator[bytes, None]:
     """Yield each frame as a line of JSON as soon as it is ready; raises BusyError and as ``Workers.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
-    faces = model.mesh(animation.mesh).faces
+    faces, memory = model.mesh(animation.mesh).faces, animation.memory(model.latents)
 
     def lines(some: slice, deadline: Deadline) -> tuple[list[bytes], Exception | None]:
         """Return the lines of some frames; with an error only the lines before it."""
         found: list[bytes] = []
-        solved = solve_all(workers, model, animation.mesh, quality, (codes[some], inside[some]), deadline)
+        own = memory[some] if isinstance(memory, Fade) else memory
+        solved = solve_all(workers, model, animation.mesh, quality, (codes[some], inside[some]), deadline, own)
         times = animation.positions[some].tolist()
         try:
             for k, t, shape in zip(count(some.start), times, solved, strict=False):

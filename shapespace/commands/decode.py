@@ -59,6 +59,7 @@ PARAMS = (
     ),
     choice("--distribution", Distribution, f"distribution of the random codes (default: {Distribution.UNIFORM})"),
     choice("--quality", Quality, f"accuracy of the shapes (default: {Quality.AUTO})"),
+    click.Option(["--no-examples"], is_flag=True, help="leave out what the model remembers of training shapes"),
     choice("--bounds", Bounds, f"what happens to codes outside the bounds (default: {Bounds.ALLOW})"),
     choice("--mesh", MeshChoice, f"mesh of the shapes (default: {MeshChoice.FINE})"),
     click.Option(["--format"], metavar="FORMAT", help=f"{', '.join(FORMATS)} (default: extension of --out, or glb)"),
@@ -78,6 +79,7 @@ def decode(
     seed: int,
     distribution: str | None,
     quality: str | None,
+    no_examples: bool,
     bounds: str | None,
     mesh: str | None,
     format: str | None,
@@ -103,7 +105,7 @@ def decode(
     for path in table:
         write(path, _table(loaded.names, [each.name for each in paths], codes))
     faces, surface = loaded.mesh(choice_of_mesh).faces, loaded.decoder.surface(choice_of_mesh)
-    how: dict[str, Any] = {} if quality is None else {"quality": quality}
+    how: dict[str, Any] = {"examples": not no_examples} | ({} if quality is None else {"quality": quality})
     missed = []
     with click.progressbar(paths, label="shapes", file=sys.stderr, hidden=not sys.stderr.isatty()) as bar:
         for k, path in enumerate(bar):

@@ -21,6 +21,7 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
+from shapespace.model.memory import FACTOR, Examples, Fade, faded, rows_of_segment, switched
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
 from shapespace.model.population import Population
 from shapespace.model.shape import Diagnostics, Quality, Shape
@@ -97,7 +98,10 @@ class Decoder:
         )
         n_nric = 2 * manifest.edges
         self._factors = [Session(bundle, factor, [factor.stop - factor.start], [n_nric]) for factor in manifest.factors]
-        self._combiner = Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric])
+        with_switch = switched(bundle.networks[manifest.combiner.file])
+        #: Whether the combiner has a memory of training shapes.
+        self.remembers = with_switch is not None
+        self._combiner = Session(bundle, manifest.combiner, [len(manifest.factors), n_nric], [n_nric], with_switch)
         self._start = None
         if manifest.start:
             self._start = Session(bundle, manifest.start, [manifest.latent_dimension], [manifest.vertices, 3])
@@ -139,6 +143,7 @@ class Decoder:
         mesh: MeshChoice = MeshChoice.FINE,
         deadline: Deadline | None = None,
         quality: Quality = Quality.FULL,
+        examples: Examples = True,
     ) -> Shape:
         """Decode one code (m,), even if Gauss–Newton does not converge: the diagnostics say so.
 
@@ -148,7 +153,7 @@ class Decoder:
         Raises NotFiniteError if the code is so far outside the bounds that numbers overflow or the predicted lengths
         form no surface, and ModelFailedError if the networks failed at this code, or took too long.
         """
-        return next(self.shapes(code[None], [inside_bounds], mesh, deadline, quality))
+        return next(self.shapes(code[None], [inside_bounds], mesh, deadline, quality, examples))
 
     def batches(self, codes: Codes, quality: Quality) -> Iterator[slice]:
         """Yield ranges of codes (n, m) for which networks run at once: in a third to all of the time of single codes.
@@ -165,11 +170,12 @@ class Decoder:
         mesh: MeshChoice = MeshChoice.FINE,
         deadline: Deadline | None = None,
         quality: Quality = Quality.FULL,
+        examples: Examples = True,
     ) -> Iterator[Shape]:
-        """Decode codes (n, m) one after another; see `shape` and `batches`."""
+        """Decode codes (n, m) one after another; see `shape`, `batches`, and `Examples`."""
         for some in self.batches(codes, quality):
             began = time.perf_counter()
-            targets = self._networks(codes[some])[1]
+            targets = self.targets(codes[some], examples if isinstance(examples, bool) else examples[some])
             seconds = (time.perf_counter() - began) / len(targets)
             for code, target, inside in zip(codes[some], targets, inside_bounds[some], strict=True):
                 yield self._solved(code, target, bool(inside), mesh, deadline, quality, seconds)
@@ -304,15 +310,34 @@ class Decoder:
         fine = self.finer(mesh)
         return fine.nearby if fine else np.ones(len(self.reference.vertices))
 
-    def _networks(self, codes: Codes) -> tuple[NDArray[np.float32], FloatArray]:
-        """Return factors (n, J, 2E) and combined NRIC (n, 2E), normalised."""
+    def targets(self, codes: Codes, examples: Examples) -> FloatArray:
+        """Return combined NRIC (n, 2E), with the memory of training shapes as wanted."""
+        if isinstance(examples, Fade):
+            if self.remembers:
+                return np.stack([self._on_segment(code, examples[k : k + 1]) for k, code in enumerate(codes)])
+            examples = True
+        factor = None if examples or not self.remembers else np.zeros((1, 1), np.float32)
+        return self._networks(codes, factor)[1]
+
+    def _on_segment(self, code: Codes, fade: Fade) -> FloatArray:
+        """Return the NRIC (2E,) of a frame. A keyframe has the bytes of its code alone."""
+        share = float(fade.share[0])
+        if share in {0, 1}:
+            return self._networks(code[None])[1][0]
+        return faded(self._networks(*rows_of_segment(code, fade))[1], share)
+
+    def _networks(
+        self, codes: Codes, memory: NDArray[np.float32] | None = None
+    ) -> tuple[NDArray[np.float32], FloatArray]:
+        """Return factors (n, J, 2E) and combined NRIC (n, 2E), normalised. ``memory`` are factors of the memory."""
         with self._limited() as until:
             parts = [
                 session(codes[:, factor.start : factor.stop], until)
                 for session, factor in zip(self._factors, self.manifest.factors, strict=True)
             ]
             factors = np.stack(parts, axis=1)
-            return factors, self._combiner(factors, until).astype(np.float64)
+            options = None if memory is None else {FACTOR: memory}
+            return factors, self._combiner(factors, until, options).astype(np.float64)
 
     def _require_triangles(self, target: FloatArray) -> None:
         """Raise NotFiniteError if too many triangles of a prediction (2E,) can't exist, see BROKEN_TRIANGLES."""

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -76,10 +77,13 @@ _watch = _Watch()
 
 class Session:
     """One ONNX network, whose input and output match the manifest. Rows of its input and output have the shapes
-    ``inputs`` and ``outputs``. Raises BundleError if the network doesn't load, or has other inputs or outputs.
+    ``inputs`` and ``outputs``. ``content`` replaces its file. Raises BundleError if the network doesn't load, or has
+    other inputs or outputs.
     """
 
-    def __init__(self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int]) -> None:
+    def __init__(
+        self, bundle: Bundle, network: Network, inputs: list[int], outputs: list[int], content: bytes | None = None
+    ) -> None:
         options = onnxruntime.SessionOptions()
         # Callers already decode in several threads, which more threads would slow down. The arena would never release
         # the memory of the largest run.
@@ -89,7 +93,7 @@ class Session:
         options.log_severity_level = _FATAL
         try:
             self._session = onnxruntime.InferenceSession(
-                bundle.networks[network.file], options, providers=["CPUExecutionProvider"]
+                content or bundle.networks[network.file], options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # ONNX Runtime's exceptions have no common public class
             raise BundleError(f"{network.file} does not load: {_first_line(error)}") from None
@@ -115,15 +119,19 @@ class Session:
         if not np.isfinite(result).all():
             raise BundleError(f"{self._file} does not give finite numbers for zeros")
 
-    def __call__(self, rows: NDArray[np.float32], until: float) -> NDArray[np.float32]:
-        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``. Raises TerminatedError if the
-        time was over, and NetworkError if the network failed or its output has another shape.
+    def __call__(
+        self, rows: NDArray[np.float32], until: float, options_by_name: Mapping[str, NDArray[np.float32]] | None = None
+    ) -> NDArray[np.float32]:
+        """Return outputs for rows (n, …) before the time ``until`` of ``time.monotonic``.
+
+        ``options_by_name`` are optional inputs. Raises TerminatedError if the time was over, and NetworkError if the
+        network failed or its output has another shape.
         """
         options = onnxruntime.RunOptions()
         options.log_severity_level = _FATAL
         _watch.begin(options, until)
         try:
-            result: Any = self._session.run([self._output], {self._input: rows}, options)[0]
+            result: Any = self._session.run([self._output], {self._input: rows, **(options_by_name or {})}, options)[0]
         except Exception as error:  # as above
             if options.terminate:
                 raise TerminatedError(f"{self._file} does not answer in time") from None

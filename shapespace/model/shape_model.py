@@ -144,6 +144,7 @@ class ShapeModel:
         mesh: MeshName = "fine",
         deadline: Deadline | None = None,
         quality: QualityName = "auto",
+        examples: bool = True,
     ) -> Shape:
         """Return the shape of one checked code (m,) with its diagnostics, even if Gauss–Newton did not converge.
 
@@ -153,6 +154,7 @@ class ShapeModel:
             mesh: "fine" or "coarse".
             deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
             quality: "auto"; "full" for the converged solution; or "draft", which leaves Gauss–Newton out. See Quality.
+            examples: False leaves out what the model remembers of training shapes.
 
         Raises:
             LatentError: the code is so far outside the bounds that it has no shape.
@@ -165,11 +167,16 @@ class ShapeModel:
         ((4601, 3), <Status.CONVERGED: 'converged'>)
         """
         given = np.asarray(code, dtype=np.float32)
-        return self.decoder.shape(given, inside_bounds, MeshChoice(mesh), deadline, Quality(quality))
+        return self.decoder.shape(given, inside_bounds, MeshChoice(mesh), deadline, Quality(quality), examples)
 
     @OneBlasThread()
     def decode(
-        self, codes: ArrayLike, mesh: MeshName = "fine", bounds: BoundsName = "allow", quality: QualityName = "auto"
+        self,
+        codes: ArrayLike,
+        mesh: MeshName = "fine",
+        bounds: BoundsName = "allow",
+        quality: QualityName = "auto",
+        examples: bool = True,
     ) -> FloatArray:
         """Return the shapes of codes.
 
@@ -180,6 +187,7 @@ class ShapeModel:
             mesh: "fine" or "coarse"; a model without a finer mesh returns its only mesh for both.
             bounds: "allow" extrapolates outside the bounds, "clamp" moves to the nearest bound, "reject" refuses.
             quality: "auto"; "full" for the converged solution; or "draft", which leaves Gauss–Newton out. See Quality.
+            examples: False leaves out what the model remembers of training shapes.
 
         Returns:
             Positions (n, V, 3), or (V, 3) for one code.
@@ -202,7 +210,8 @@ class ShapeModel:
         checked, inside = self.latents.codes(np.atleast_2d(values), Bounds(bounds))
         positions = np.empty((len(checked), *self.mesh(choice).vertices.shape))
         ended = []
-        for k, shape in enumerate(self.decoder.shapes(checked, inside, choice, quality=Quality(quality))):
+        solved = self.decoder.shapes(checked, inside, choice, quality=Quality(quality), examples=examples)
+        for k, shape in enumerate(solved):
             positions[k] = shape.vertices
             ended.append(shape.diagnostics.status)
         missed = [k for k, status in enumerate(ended) if status is not Status.CONVERGED]

@@ -47,6 +47,8 @@ def r_squared(predicted: NDArray, exact: NDArray, norm: WeightedNorm) -> dict[st
 
 #: Number of frames of an interpolation for the report.
 STRIP_FRAMES = 7
+#: Number of random shapes for the report.
+RANDOM_SHOWN = 8
 #: Map from codes (n, m) to NRIC of joint shapes (n, 2E), or of factor shapes (n, J, 2E).
 Model = Callable[[torch.Tensor], torch.Tensor]
 
@@ -334,7 +336,7 @@ def model_times(collection: Collection, composite: Model, eta: float) -> dict[st
 
 
 def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray) -> dict[str, NDArray]:
-    """Return the test shapes with the least, the median and the largest error next to the exact shapes.
+    """Return the test shapes with the least, the median and the largest error next to the exact shapes, and a few more.
 
     Vertices (n, V, 3) are aligned to exact ones; ``errors`` (n, V) are their distances, ``index`` (n,) the samples'
     indices.
@@ -346,6 +348,8 @@ def extremes(predicted: NDArray, exact: NDArray, errors: NDArray, index: NDArray
         "test_exact": exact[chosen],
         "test_predicted": predicted[chosen],
         "test_error": errors[chosen],
+        # Test codes are random. These shapes show what a random code gives.
+        "random": predicted[:RANDOM_SHOWN],
     }
 
 

@@ -123,6 +123,15 @@ def extreme_shapes(record: Record, studio: Studio) -> dict[str, Any] | None:
     return {"rows": rows, "bar": colour_bar(ERROR, *(percent(top * x) for x in (0.01, 0.1, 1)))}
 
 
+def random_shapes(record: Record, studio: Studio) -> list[Markup]:
+    """Draw shapes of random codes, which the networks made."""
+    shapes = record.gallery.get("random", ())
+    return [
+        studio.draw(align(shape, studio.base), f"Random shape {k}", SMALL, COMPOSITE)
+        for k, shape in enumerate(shapes, 1)
+    ]
+
+
 def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]]:
     """Compare the user's shapes, held-out and learned ones, with the nearest shapes of the space.
 

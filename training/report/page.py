@@ -11,12 +11,14 @@ from shapespace.training.report.cards import (
     factor_cards,
     interpolation_strips,
     mode_cards,
+    random_shapes,
     shape_pictures,
 )
 from shapespace.training.report.charts import fraction_chart, loss_charts, mode_charts, overlap_chart
 from shapespace.training.report.number_format import duration, figure, flatten, percent, r2, size
 from shapespace.training.report.pictures import NEUTRAL, Studio, colour_bar, ramp
 from shapespace.training.report.record import Record
+from shapespace.training.report.verdict import advice, verdict
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES
 
@@ -81,6 +83,9 @@ def page(record: Record) -> str:
         title=export.get("title") or record.run.folder.resolve().name,
         description=export.get("description", ""),
         record=record,
+        verdict=verdict(record),
+        advice=list(advice(record)),
+        served=bool(record.seconds.get("export")),
         accuracy=accuracy_cards(record, close or None),
         qualities=_qualities(record),
         geometry=_geometry(record.geometry),
@@ -100,6 +105,7 @@ def page(record: Record) -> str:
         overlap=overlap_chart(record),
         losses=list(loss_charts(record)),
         longest=max((seconds for seconds in record.seconds.values() if seconds), default=1.0),
+        random=random_shapes(record, studio) if studio else [],
         tests=extreme_shapes(record, studio) if studio else None,
         strips=list(interpolation_strips(record, studio)) if studio else [],
         evaluation=figures,

@@ -40,7 +40,7 @@ class Studio:
         if record.base is None or importlib.util.find_spec("embreex") is None:
             return None
         base, faces = record.base.astype(np.float64), record.reference["faces"]
-        names = {"test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
+        names = {"random", "test_exact", "test_predicted", "strip_joint", "strip_factors"} & record.gallery.keys()
         shapes = [align(record.gallery[name].reshape(-1, *base.shape), base) for name in sorted(names)]
         return cls(Camera.facing(base, faces, np.concatenate([base[None], *shapes])), base, faces)
 

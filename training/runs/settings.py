@@ -276,6 +276,11 @@ class ExportSettings(SettingsTable):
     """New names of factors and coordinates, by the name in the report: ``{"upper right" = "left arm"}``. Coordinates
     follow their factor unless they are named themselves."""
 
+    @property
+    def key(self) -> dict[str, Any]:
+        """The settings in the key of the stage. Finished runs of version 0.2 keep their key, and their bundle."""
+        return self.model_dump(mode="json", exclude={"decoder"} if self.decoder else None)
+
     @model_validator(mode="after")
     def _upright(self) -> ExportSettings:
         if self.faces is not None and self.faces[1] == self.up[1]:

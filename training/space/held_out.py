@@ -82,14 +82,17 @@ def held_out(
     steps: int | None = None,
     original: IntArray | None = None,
     first_step: FirstStep = "centred",
+    *,
+    remember: bool = True,
 ) -> HeldOut:
     """Find mean and modes without some shapes, and approximate these shapes.
 
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
     number of the other shapes. The map from codes to shapes is as configured for the other shapes. ``steps`` is K, by
-    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. Raises ModeError if the other
-    shapes have no mean, or no modes.
+    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. Straight lines of vertices
+    ``remember`` the shapes that they were found from, as bundles do. Raises ModeError if the other shapes have no mean,
+    or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
@@ -113,10 +116,11 @@ def held_out(
     for each in [-(-count // 2), count] if counts is None else counts:
         found = space.first(min(each, len(kept) - 1)).nearest(unseen)
         reached.append(found.codes.shape[1])
-        near["modes"].append(found.vertices)
         stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
         for kind, nearest in rivals.items():
             near[kind].append(nearest(unseen, reached[-1]))
+        remembered = remember and choice.kind == "vertices"
+        near["modes"].append(near["remembering_components"][-1] if remembered else found.vertices)
     return HeldOut(index, reached, near, np.full(len(index), choice.light_steps), stuck)
 
 

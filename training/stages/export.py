@@ -149,7 +149,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="export",
     version=1,
-    settings=lambda config: [config.export],
+    settings=lambda config: [config.export.key],
     run=export_bundle,
     results=lambda run: [run.encoded.path, run.least_near.path],
     warnings=_warnings,

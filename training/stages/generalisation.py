@@ -25,12 +25,8 @@ def measure_generalisation(run: Run) -> None:
     some = folds(count)[: 1 if count >= 2 * FOLDS else None]
     facts: dict[str, Any]
     try:
-        found = joined(
-            [
-                held_out(reference, shapes, each, None, settings, material, original=original, first_step=first_step)
-                for each in some
-            ]
-        )
+        how: dict[str, Any] = {"original": original, "first_step": first_step, "remember": run.config.export.examples}
+        found = joined([held_out(reference, shapes, each, None, settings, material, **how) for each in some])
     except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use
         facts = {"failed": str(error)}
     else:
@@ -61,7 +57,10 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="generalisation",
     version=1,
-    settings=lambda config: [],
+    # Exponentials are measured without memory. Runs of version 0.2 had nothing else, and keep their key.
+    settings=lambda config: (
+        [] if config.modes.geometry == "exponential" else [config.export.model_dump(include={"examples"})]
+    ),
     run=measure_generalisation,
     results=lambda run: [run.generalisation.path, run.least_general.path],
     warnings=_warnings,

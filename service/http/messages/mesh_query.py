@@ -15,6 +15,7 @@ from shapespace.mesh.attributes import Topology
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds, CheckedCode
+from shapespace.model.memory import Examples
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import require_covariance
@@ -194,6 +195,7 @@ class MeshOptions:
         quality: Quality,
         bounds: Bounds = Bounds.ALLOW,
         covariance: Sequence[Sequence[float]] | None = None,
+        examples: Examples = True,
     ) -> ShapeRequest:
         """Return the request for the shape of a code, None for the reference; raises ProblemError or LatentError.
 
@@ -202,7 +204,8 @@ class MeshOptions:
         colour_by = self.color.on(model, bounds, covariance)
         polygons = SHAPE_FORMATS[self.format].polygons
         topology = choose_topology(self.topology, self.format, model, mesh, polygons=polygons)
-        return ShapeRequest(code, mesh, self.format, quality, colour_by, self.place, topology)
+        examples = examples if model.decoder.remembers else True
+        return ShapeRequest(code, mesh, self.format, quality, colour_by, self.place, topology, examples)
 
 
 async def _frame(

@@ -45,6 +45,14 @@ QualityField = Annotated[
         "`Shape-Diagnostics.quality` says which quality was answered."
     ),
 ]
+ExamplesField = Annotated[
+    bool,
+    Field(
+        strict=True,
+        description="Whether the shape has what the model remembers of training shapes: corrections that vanish away "
+        "from their codes. `false` leaves them out.",
+    ),
+]
 BoundsField = Annotated[
     Bounds,
     Field(
@@ -61,6 +69,7 @@ class MeshRequest(Body):
     mesh: MeshField = MeshChoice.FINE
     bounds: BoundsField = Bounds.ALLOW
     quality: QualityField = Quality.AUTO
+    examples: ExamplesField = True
     covariance: Annotated[list[Annotated[list[Number], Field(fail_fast=True)]] | None, Field(fail_fast=True)] = Field(
         None, description="With `?color=spread`: m × m covariance of the code, as `edit`, `encode` and `fit` answer it."
     )

@@ -11,13 +11,17 @@ from fastapi.responses import StreamingResponse
 
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.model.shape import Quality
+from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
     CallerDependency,
+    ExamplesOfBody,
+    ExamplesQuery,
     Format,
     MeshQuery,
     Model,
     QualityQuery,
+    Service,
     ServiceDependency,
     note_model,
     one_of,
@@ -41,6 +45,7 @@ from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.sequence import (
     find_interpolation,
     frame_code,
+    frame_memory,
     interpolation_id,
     sequence_file,
     sequence_lines,
@@ -68,9 +73,12 @@ async def create_interpolation(
     body: Annotated[Animation, Depends(JSONBody(Animation))],
     response: Response,
     mesh: MeshQuery = None,
+    examples: ExamplesOfBody = None,
 ) -> InterpolationAnswer:
     """Address of the animation along a path of codes. Nothing is stored: the id holds the whole animation."""
-    body = body.model_copy(update={"mesh": mesh or body.mesh})
+    body = body.model_copy(
+        update={"mesh": mesh or body.mesh, "examples": body.examples if examples is None else examples}
+    )
     id = interpolation_id(model, body, service.settings.max_frames)
     path = f"/v1/interpolations/{id}"
     response.headers["Location"] = path
@@ -89,6 +97,7 @@ async def get_interpolation(
     caller: CallerDependency,
     id: Id,
     quality: QualityQuery = Quality.AUTO,
+    examples: ExamplesQuery = True,
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
@@ -98,7 +107,7 @@ async def get_interpolation(
 ) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or a stream of JSON lines."""
     chosen = _choose_format(request, format, color)
-    animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
+    animation, model = _found(service, id, examples=examples)
     note_model(request, model)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):
@@ -108,7 +117,7 @@ async def get_interpolation(
     polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
     colour_by = color.on(model)
-    options = tag_options(quality, colour_by, faces)
+    options = tag_options(quality, colour_by, faces, animation.examples)
     options += [] if fps is None else [f"{fps} frames a second"]
     tag = entity_tag("animation", id, chosen, *options)
     if answer := not_modified(request, tag):
@@ -138,12 +147,19 @@ async def get_frame(
     k: Annotated[int, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
     options: FrameQuery,
     quality: QualityQuery = Quality.AUTO,
+    examples: ExamplesQuery = True,
 ) -> Response:
     """One frame of an animation in any mesh format."""
-    animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
+    animation, model = _found(service, id, examples=examples)
     note_model(request, model)
-    wanted = options.shape(model, frame_code(model, animation, k), animation.mesh, quality)
+    code, memory = frame_code(model, animation, k), frame_memory(model, animation, k)
+    wanted = options.shape(model, code, animation.mesh, quality, examples=memory)
     return await shape_response(service, request, caller, model, wanted)
+
+
+def _found(service: Service, id: str, *, examples: bool) -> tuple[Animation, ShapeModel]:
+    animation, model = find_interpolation(service.repository, id, service.settings.max_frames)
+    return animation.model_copy(update={"examples": animation.examples and examples}), model
 
 
 def _choose_format(request: Request, format: str | None, color: ColourParameters) -> str:

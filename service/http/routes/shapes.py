@@ -12,6 +12,8 @@ from shapespace.model.shape import Quality
 from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import (
     CallerDependency,
+    ExamplesOfBody,
+    ExamplesQuery,
     Format,
     MeshQuery,
     Model,
@@ -61,10 +63,12 @@ async def get_mesh(
     ] = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     quality: QualityQuery = Quality.AUTO,
+    examples: ExamplesQuery = True,
 ) -> Response:
     """The shape of a code as a mesh file, by an address for links and browsers."""
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
-    return await shape_response(service, request, caller, model, options.shape(model, code, mesh, quality, bounds))
+    wanted = options.shape(model, code, mesh, quality, bounds, examples=examples)
+    return await shape_response(service, request, caller, model, wanted)
 
 
 @router.post(
@@ -79,10 +83,13 @@ async def post_mesh(
     options: SingleMeshQuery,
     mesh: MeshQuery = None,
     quality: QualityOfBody = None,
+    examples: ExamplesOfBody = None,
 ) -> Response:
     """The shape of a code as a mesh file."""
     code = model.latents.code(body.latent, body.bounds)
-    wanted = options.shape(model, code, mesh or body.mesh, quality or body.quality, body.bounds, body.covariance)
+    how = mesh or body.mesh, quality or body.quality, body.bounds, body.covariance
+    remembered = body.examples if examples is None else examples
+    wanted = options.shape(model, code, *how, remembered)
     return await shape_response(service, request, caller, model, wanted)
 
 

@@ -27,7 +27,20 @@ from shapespace.training.stages.run import STAGES
 from tests.training.conftest import Said
 
 NASTY = "<script>alert('thumb')</script>"
-SECTIONS = {"nearness", "shapes", "modes", "factors", "strip", "tests", "figures", "losses", "stages", "configuration"}
+SECTIONS = {
+    "verdict",
+    "random",
+    "nearness",
+    "shapes",
+    "modes",
+    "factors",
+    "strip",
+    "tests",
+    "figures",
+    "losses",
+    "stages",
+    "configuration",
+}
 CONFIG = '[collection]\n[export]\ntitle = "Sphere & Co <b>"\ndescription = "Made up."\n'
 VOID = {"br", "hr", "img", "input", "link", "meta"}
 
@@ -70,7 +83,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "gallery.npz",
         faces=faces, test_index=[7, 8, 9], test_exact=shapes, test_predicted=1.01 * shapes,
         test_error=np.array([0.001, 0.01, 0.1])[:, None] * (x[:, 1] - x[:, 1].min()),
-        strip_joint=shapes, strip_factors=np.array([shapes, shapes[::-1]]),
+        random=shapes, strip_joint=shapes, strip_factors=np.array([shapes, shapes[::-1]]),
     )  # fmt: skip
     for name in ("least-general", "least-near"):
         np.savez(folder / f"{name}.npz", given=shapes[1], found=shapes[2])
@@ -228,6 +241,14 @@ def partial(run: Path, folder: Path, *names: str) -> Page:
 
 def test_every_section_is_there_with_its_figures(page: Page) -> None:
     assert page.sections == SECTIONS
+    assert "mean error of 0.47\xa0% of the diagonal, 11\xa0% less than the best simple model (PCA)." in page.words
+    for sentence in (
+        "fell from 2.3\xa0% to 0.47\xa0%. Try modes.count = 6",
+        "Try samples.count = 8000",
+        "shapespace serve",
+    ):
+        assert sentence in page.words
+    assert "More shapes" not in page.words
     words = page.words.replace("\N{NO-BREAK SPACE}", " ")
     for said in ("Sphere & Co <b>", "0.9876", "0.8765", "0.7765", "1.2 %", "4.2 ms", "12.3 MB", "without <i>this</i>",
                  "SPGA 0.7531, PGA 0.8531", "a perceptron at every edge. Its error on held-out codes is 0.46 % of",
@@ -241,7 +262,7 @@ def test_every_section_is_there_with_its_figures(page: Page) -> None:
     assert {f"{key} of the SPGA by iteration" for key in ("objective", "support")} <= labels
     assert "Localisation by mode, SPGA and PGA" in labels
     assert {"Overlap of the factors", "R² by share of the samples"} <= labels
-    assert len(page.pictures) == 2 * 2 + 3 + 2 * 4 + 3 + 3 + 2 * 3  # nearness, shapes, modes, factors, strip, tests
+    assert len(page.pictures) == 2 * 2 + 3 + 2 * 4 + 3 + 3 + 3 + 2 * 3, "all sections but the figures"
 
 
 def test_the_page_opens_with_how_near_the_space_comes_to_the_shapes_of_the_user(page: Page) -> None:
@@ -326,7 +347,7 @@ def test_a_run_on_its_way_makes_a_partial_report(run: Path, tmp_path: Path) -> N
     page = partial(run, tmp_path / "b", "reference.npz", "factors.json")  # as a generator's run, which has no modes
     assert page.sections == {"shapes", "factors", "configuration"}
     page = partial(run, tmp_path / "c", "reference.npz", "modes.npz", "evaluation.json")
-    assert page.sections == {"shapes", "modes", "figures", "configuration"}
+    assert page.sections == {"verdict", "shapes", "modes", "figures", "configuration"}
 
 
 def test_stages_say_how_far_the_run_is(run: Path, tmp_path: Path) -> None:

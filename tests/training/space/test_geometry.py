@@ -26,6 +26,7 @@ def test_sums_of_displacements_are_straight_lines_of_vertices(blends):
     away = again.distances(shapes, mesh.diagonal)
     assert away.keys() == {"modes", "components", "remembering_components", "linear_nric"}
     assert away["modes"][1].mean() <= 1.01 * away["components"][1].mean()
+    assert np.array_equal(again.near["modes"][0], again.near["remembering_components"][0]), "as bundles remember"
 
 
 def test_shapes_that_bend_are_no_straight_lines_of_vertices(ellipsoid):
