@@ -6,6 +6,7 @@ The unit is a solved shape, timed beside each fit, so that the figures depend li
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,7 +42,7 @@ def measured(model: ShapeModel, variant: str, seed: int, *, by_surface: bool) ->
     turn, shift = Rotation.random(random_state=rng), rng.normal(size=3) * size
     found = []
     codes = model.sample(TIMED, seed=seed + 1000)
-    unit = float(np.median([seconds(lambda code=code: model.decode(code, quality="full")) for code in codes]))
+    unit = float(np.median([seconds(partial(model.decode, code, quality="full")) for code in codes]))
     spent = seconds(lambda: found.append(model.fit_scan(turn.apply(points) + shift, partial=variant == "camera")))
     back = turn.inv().apply(found[0].placement(found[0].shape.vertices) - shift)
     away = np.linalg.norm(back - truth, axis=1)

@@ -28,14 +28,22 @@ NO_MATHEMATICS = {
     "shapespace.model.encode_faults",
     "shapespace.model.fit_constraints",
     "shapespace.model.fit_result",
+    "shapespace.model.fit_settings",
     "shapespace.model.inputs",
     "shapespace.model.latent_space",
+    "shapespace.model.memory",
+    "shapespace.model.network_program",
     "shapespace.model.networks",
     "shapespace.model.options",
+    "shapespace.model.shape",
     "shapespace.model.shape_model",
+    "shapespace.training.learning.allocator",
+    "shapespace.training.learning.decoder_graph",
     "shapespace.training.learning.device",
     "shapespace.training.learning.export",
+    "shapespace.training.learning.graph_storage",
     "shapespace.training.learning.naming",
+    "shapespace.training.space.straight_collection",
 }
 
 

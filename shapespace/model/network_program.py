@@ -26,7 +26,9 @@ class Operations(Protocol):
     """Operations whose names differ between NumPy and PyTorch."""
 
     #: The functions with the same names: ``exp``, ``sqrt``, ``sin``, ``cos``, ``einsum``, ``broadcast_to``.
-    functions: Any
+    @property
+    def functions(self) -> Any:
+        ...
 
     def cast(self, x: Value, to: int) -> Value:
         """Convert to a type of ONNX, if that matters."""

@@ -106,7 +106,7 @@ def test_examples_are_as_described_and_answered_as_described(served: Server, nam
                 validator(contents["application/json"]["schema"]).validate(body)
             answer = client.request(method, path, json=body)
             described = call["responses"][str(answer.status_code)]
-            # The model of the examples has an angle and no decoder, so these are 422 and 404. Other tests use the figure.
+            # The model of the examples has an angle and no decoder: 422 and 404. Other tests use the figure.
             assert answer.is_success or path.endswith(("/blendshapes", "/decoder.onnx")), answer.text
             media_type = answer.headers["Content-Type"].partition(";")[0]
             if media_type == "application/json":

@@ -126,7 +126,7 @@ class AnnyBody:
         torch, n = self._torch, len(angles)
         poses = np.tile(np.eye(4), (n, len(self.bones), 1, 1))
         if turns:
-            vectors = np.einsum("nd,dbx->nbx", angles, self._turns)
+            vectors = np.einsum("na,abx->nbx", angles, self._turns)
             poses[:, :, :3, :3] = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(n, -1, 3, 3)
         plain = {name: np.full(n, 0.5) for name in self.forms}
         with torch.no_grad():
