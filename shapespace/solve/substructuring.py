@@ -45,7 +45,7 @@ class Substructures:
         graph.eliminate_zeros()
         components = connected_components(graph, directed=False)[1]
         # Each component needs a node in the separator, so that the equation of a block has one solution.
-        separator = np.unique(components, return_index=True)[1]
+        separator: IntArray = np.unique(components, return_index=True)[1].astype(np.int64)
         parts = _without(np.arange(size), separator, size)
         best, entries = (parts, separator), _entries(parts, separator)
         for _ in range(HALVINGS):

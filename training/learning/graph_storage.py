@@ -6,6 +6,7 @@ import itertools
 import string
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import onnx
@@ -140,7 +141,7 @@ class FixedPoint:
     def of(cls, matrix: NDArray, bits: int) -> FixedPoint:
         """Round a matrix."""
         x, most = matrix.astype(np.float64), _most(bits)
-        rows = np.ones(1)
+        rows: NDArray = np.ones(1)
         if x.shape[-1] >= cls.LONG:
             rows = _positive(np.abs(x).max(axis=-1, keepdims=True))
         columns = _positive(np.abs(x / rows).max(axis=-2, keepdims=True))
@@ -196,7 +197,7 @@ def _from_bytes(
     def number(value: int) -> str:
         return keep(f"{value}.{kind}", np.array(value, helper.tensor_dtype_to_np_dtype(kind)))
 
-    def node(operator: str, *inputs: str, output: str = "", **attributes: int) -> str:
+    def node(operator: str, *inputs: str, output: str = "", **attributes: Any) -> str:
         name = output or f"{target}.step{len(nodes)}"
         nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
