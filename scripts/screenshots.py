@@ -68,7 +68,7 @@ def main() -> None:
         cloud = "\n".join(f"{x} {float(y) + 5} {z}" for x, y, z in points).encode()
         page.get_by_role("tab", name="Files").click()
         page.locator("#mesh-file").set_input_files({"name": "cloud.xyz", "mimeType": "text/plain", "buffer": cloud})
-        page.wait_for_selector("#verdict:not(:empty)")
+        page.wait_for_selector("#verdict:is(.good, .fair, .poor)")
         page.wait_for_timeout(3000)
         save_small(page, DOCS / "tutorial" / "scan.webp")
 

@@ -244,7 +244,7 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
 
     studio.page.route("**/vertices*", off)
     studio.open()
-    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 6)
     chip = studio["#diagnostics summary"]
     assert chip.inner_text() == "Looks right", "all shapes of this model have as large a residual"
     assert studio["#diagnostics"].get_attribute("class") == "good"
@@ -410,7 +410,7 @@ def test_pointing_at_a_factor_colours_where_it_changes_lengths_and_angles(window
 
 
 def test_pictures_of_each_coordinate(studio: OpenPage) -> None:
-    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 9)
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 6)
     less, more = (body(studio.coordinate(0).locator("canvas").nth(i)) for i in range(2))
     covered = [(picture[..., 3] > 0).mean() for picture in (less, more)]
     assert covered[0] < covered[1], "this coordinate scales the shape"

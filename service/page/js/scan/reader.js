@@ -138,6 +138,7 @@ export class Reader {
     this.#abort.abort();
     this.#abort = new AbortController();
     this.#found = null;
+    this.shown.parentElement.hidden = true;
     this.store.set({ scan: null, found: null });
   }
 
