@@ -27,8 +27,7 @@ class Operations(Protocol):
 
     #: The functions with the same names: ``exp``, ``sqrt``, ``sin``, ``cos``, ``einsum``, ``broadcast_to``.
     @property
-    def functions(self) -> Any:
-        ...
+    def functions(self) -> Any: ...
 
     def cast(self, x: Value, to: int) -> Value:
         """Convert to a type of ONNX, if that matters."""

@@ -43,7 +43,7 @@ class Substructures:
         graph = sparse.csr_array(graph + graph.T)
         graph.setdiag(0)
         graph.eliminate_zeros()
-        components = connected_components(graph, directed=False)[1]
+        components = connected_components(graph, directed=False)[1].astype(np.int64)
         # Each component needs a node in the separator, so that the equation of a block has one solution.
         separator: IntArray = np.unique(components, return_index=True)[1].astype(np.int64)
         parts = _without(np.arange(size), separator, size)

@@ -212,10 +212,10 @@ class ComponentMeans(ArrayModule):
         return x - self(x)
 
 
-def _in_slots(matrix: sparse.sparray, unknowns: IntArray) -> sparse.csr_array:
+def _in_slots(matrix: sparse.csr_array, unknowns: IntArray) -> sparse.csr_array:
     """Return the rows of a matrix in the order of slots; rows of empty slots are zero."""
-    rows = sparse.csr_array(matrix)[np.maximum(unknowns, 0)]
-    return sparse.csr_array(sparse.diags_array((unknowns >= 0).astype(float)) @ rows)
+    rows = matrix[np.maximum(unknowns, 0)]
+    return rows.multiply((unknowns >= 0).astype(float)[:, None]).tocsr()
 
 
 def _component_means(points: FloatArray, components: IntArray) -> FloatArray:

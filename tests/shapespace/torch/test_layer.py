@@ -10,6 +10,7 @@ import torch
 
 import shapespace
 from shapespace.torch import ShapeLayer
+from tests.shapespace.torch.conftest import BUNDLED
 
 
 def away(model: shapespace.ShapeModel, found: np.ndarray, codes: np.ndarray) -> float:
@@ -31,10 +32,9 @@ def test_layer_returns_drafts(model: shapespace.ShapeModel) -> None:
     assert np.allclose(layer.upper, model.upper)
 
 
+@pytest.mark.parametrize("model", BUNDLED, indirect=True)
 def test_graph_returns_drafts_and_misfits(model: shapespace.ShapeModel) -> None:
     entry, files = model.manifest.decoder, model.manifest.files
-    if entry is None:
-        pytest.skip("the tiny bundle has no graph")
     session = onnxruntime.InferenceSession(model.folder / entry.file, providers=["CPUExecutionProvider"])
     codes = model.sample(4, seed=4)
     vertices, misfit = session.run(["vertices", "misfit"], {"latent": codes})
