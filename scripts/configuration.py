@@ -56,7 +56,8 @@ def words(annotation: Any) -> str:
         return " or ".join(dict.fromkeys(words(part) for part in parts if part is not type(None)))
     if origin is list:
         kind, *bounds = words(parts[0]).split(", ")
-        return ", ".join([f"list of {kind}" + ("s" if kind != "text" else ""), *bounds])
+        inside = kind.replace("list of", "lists of") if kind.startswith("list of") else f"{kind}s"
+        return ", ".join([f"list of {kind if kind == 'text' else inside}", *bounds])
     if origin is dict:
         if parts[1] is Any:
             return "table"

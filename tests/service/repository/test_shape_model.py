@@ -87,9 +87,9 @@ def test_every_start_ends_in_one_shape(bundled: ShapeModel) -> None:
     """To 1e-4 of the diagonal, from the server's initial guess, the reference, and another code's shape."""
     reference, codes = bundled.reference, wide_codes(bundled, 4)
     solver = Reconstructor(reference, bundled.manifest.eta_reconstruction)
-    other = bundled.shape(codes[-1], mesh=MeshChoice.COARSE).vertices / bundled.manifest.scale
+    other = bundled.shape(codes[-1], mesh=MeshChoice.COARSE, quality="full").vertices / bundled.manifest.scale
     for code in codes[:-1]:
-        shape = bundled.shape(code, mesh=MeshChoice.COARSE)
+        shape = bundled.shape(code, mesh=MeshChoice.COARSE, quality="full")
         assert shape.diagnostics.status is Status.CONVERGED
         target = bundled.decoder._networks(code[None])[1][0]
         for start in (reference.vertices, other):
