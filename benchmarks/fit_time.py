@@ -31,17 +31,22 @@ def seconds(work: Callable[[], object]) -> float:
     return time.process_time() - begun
 
 
+def drawn(model: ShapeModel, count: int, seed: int) -> FloatArray:
+    """Return codes (count, m) of the population, inside the bounds."""
+    return np.clip(model.population.sample(count, seed), model.lower, model.upper)
+
+
 def measured(model: ShapeModel, variant: str, seed: int, *, by_surface: bool) -> tuple[float, float, str]:
     """Fit one scan. Return its time in solved shapes, its error as a share of the diagonal, and its status."""
     rng = np.random.default_rng(seed)
-    truth = model.decode(model.sample(1, seed=seed)[0], quality="full")
+    truth = model.decode(drawn(model, 1, seed)[0], quality="full")
     size = model.manifest.scale * model.mesh().diagonal
     points: FloatArray = sampled(truth, model.faces, POINTS, rng)
     if variant != "whole":
         points, _ = scan(truth, model.faces, variant, 0, rng)
     turn, shift = Rotation.random(random_state=rng), rng.normal(size=3) * size
     found = []
-    codes = model.sample(TIMED, seed=seed + 1000)
+    codes = drawn(model, TIMED, seed + 1000)
     unit = float(np.median([seconds(partial(model.decode, code, quality="full")) for code in codes]))
     spent = seconds(lambda: found.append(model.fit_scan(turn.apply(points) + shift, partial=variant == "camera")))
     back = turn.inv().apply(found[0].placement(found[0].shape.vertices) - shift)
