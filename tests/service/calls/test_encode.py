@@ -100,7 +100,7 @@ def test_off_is_read_though_it_is_never_written(client: httpx.Client) -> None:
 
 
 def test_the_page_lets_choose_every_format(client: httpx.Client) -> None:
-    (accepted,) = re.findall(r'id="mesh-file" accept="(.*?)"', client.get("/").text)
+    (accepted,) = re.findall(r'id="mesh-file"[^>]* accept="(.*?)"', client.get("/").text)
     assert set(accepted.split(",")) == {f".{format}" for format in POINT_FORMATS}
 
 

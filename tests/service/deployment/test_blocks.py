@@ -45,6 +45,9 @@ UNTRIED = {
     ("docs/how-to/collections.md", "pip install 'shapespace[train,people]'"): (
         "installs 500 MB and trains for more than an hour; `make long people` makes the same bodies"
     ),
+    ("docs/how-to/gpu.md", "pip install --force-reinstall --no-deps torch==2.13.0 --index-url INDEX"): (
+        "needs a GPU and an index of PyTorch"
+    ),
     ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the block above it sends the same request",
 }
 

@@ -366,16 +366,18 @@ def test_far_shapes_are_reached_by_way_of_their_neighbours():
     assert [path.converged for path in straight] == [False, True, False]
     found = logarithms(space, start, shapes, 8, workers=1)
     assert found.status == (Status.CONVERGED,) * 3
-    assert found.steps == (8, 8, 8)
+    # The longest path may need twice as many steps.
+    assert found.steps[1:] == (8, 8)
+    assert found.steps[0] in (8, 16)
     assert found.via[1] == -1
     assert found.via[0] >= 0 <= found.via[2]
     assert [bool(reason) for reason in found.reasons] == [True, False, True]
-    for shape, field in zip(shapes, found.fields, strict=True):
-        end = exponential(space, start, field, 8)
+    for shape, field, steps in zip(shapes, found.fields, found.steps, strict=True):
+        end = exponential(space, start, field, steps)
         assert end.converged
         assert align(end.vertices[-1], shape) == pytest.approx(shape, abs=1e-3 * rod.diagonal)
         # A path with a detour or across a fold would be longer than the distance of the shapes.
-        whole = geodesic(space, start, shape, 8, tolerance=1e-6, first=end.vertices)
+        whole = geodesic(space, start, shape, steps, tolerance=1e-6, first=end.vertices)
         assert space.norm(start, field) == pytest.approx(np.sqrt(whole.energy), rel=0.3)
 
 

@@ -129,11 +129,11 @@ def test_all_networks_are_tuned_together_once(copy: Run, monkeypatch: pytest.Mon
     first, plain = learner.composite(tuned), learner.main()
     assert sum(name.startswith("joint-") for name in learner.histories) == 1
     codes = torch.as_tensor(learner.joint.latents[:3], dtype=torch.float32)
+    assert r2(learner, first, "validation") >= r2(learner, plain, "validation"), "the best epoch counts"
     monkeypatch.setattr(Learner, "joint", None)  # samples are not needed any more
     again = learner_of(copy).composite(tuned)
     with torch.no_grad():
         assert torch.equal(first(codes), again(codes))
-        assert not torch.equal(first(codes), plain(codes))
 
 
 def test_every_run_of_the_pages_has_valid_studies() -> None:
