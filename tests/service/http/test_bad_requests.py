@@ -62,7 +62,7 @@ REQUESTS = {
     "unknown bounds": post(MESH, {"latent": OK, "bounds": "wrap"}, 422, "invalid-request", "'allow', 'clamp' or"),
     "unknown mesh": post(MESH, {"latent": OK, "mesh": "finest"}, 422, "invalid-request", "'fine' or 'coarse'"),
     "out of bounds": post(
-        MESH, {"latent": [0.3, 0, 0], "bounds": "reject"}, 422, "out-of-bounds", 'Move it inside, or choose clamp or allow for bounds'
+        MESH, {"latent": [0.3, 0, 0], "bounds": "reject"}, 422, "out-of-bounds", "or choose clamp or allow for bounds"
     ),
     "text in a link": get(f"{MESH}?latent=a,b,c", 422, "invalid-request", "separated by commas"),
     "NaN in a link": get(f"{MESH}?latent=nan,0,0", 422, "not-finite", "Send finite numbers"),
