@@ -75,7 +75,10 @@ def test_shapes_are_those_of_the_server(models: Path, client: httpx.Client, name
     np.testing.assert_array_equal(found.astype(np.float32), np.array(answer["vertices"], np.float32))
     drawn = client.get(f"/v1/models/{name}/mesh", params={"mesh": mesh, "format": "json"}).json()
     np.testing.assert_array_equal(model.mesh(MeshChoice(mesh)).faces, drawn["faces"])
-    np.testing.assert_array_equal(model.decode(codes[1], mesh=mesh), found[1])
+    # Networks run for several codes at once, except for full shapes. This changes the last digits.
+    np.testing.assert_allclose(model.decode(codes[1], mesh=mesh), found[1], atol=1e-5)
+    full = model.decode(codes, mesh=mesh, quality="full")
+    np.testing.assert_array_equal(model.decode(codes[1], mesh=mesh, quality="full"), full[1])
     clamped = post(client, name, "vertices", latents=(9 * codes).tolist(), mesh=mesh, bounds="clamp")
     found = model.decode(9 * codes, mesh, "clamp")
     np.testing.assert_array_equal(found.astype(np.float32), np.array(clamped["vertices"], np.float32))
