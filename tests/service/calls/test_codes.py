@@ -54,8 +54,9 @@ def test_an_edit_reaches_what_can_be_reached(client: httpx.Client, name: str, se
     diagonal = np.linalg.norm(np.ptp(shape, axis=0))
     distances = np.linalg.norm(reached[vertices] - shape[vertices], axis=1)
     assert distances.max() < 0.01 * diagonal
-    np.testing.assert_allclose(found["distances"], distances, atol=1e-5)
-    assert found["residual"] == pytest.approx(np.sqrt((distances**2).mean()), abs=1e-5)
+    # An edit ends with a full shape, and quality `auto` differs a little from it.
+    np.testing.assert_allclose(found["distances"], distances, atol=5e-5)
+    assert found["residual"] == pytest.approx(np.sqrt((distances**2).mean()), abs=5e-5)
     card = client.get(f"/v1/models/{name}").json()
     assert (np.array(card["lower"]) <= np.array(found["latent"]) + 1e-6).all()
     assert (np.array(found["latent"]) <= np.array(card["upper"]) + 1e-6).all()
@@ -192,7 +193,7 @@ def test_exact_exponentials_stand_beside_the_networks_answer(client: httpx.Clien
 
 
 def test_an_exponential_that_fails_is_null(client: httpx.Client) -> None:
-    body = {"latents": [[30.0] * 20, [0.0] * 20], "mesh": "coarse", "exact": True}
+    body = {"latents": [[3.0] * 20, [0.0] * 20], "mesh": "coarse", "exact": True}
     answer = client.post("/v1/models/figure/vertices", json=body).raise_for_status().json()
     assert answer["exact"][0] is None
     assert answer["distance"][0] is None

@@ -189,10 +189,11 @@ def test_side_by_side_gives_the_bytes_of_one_at_a_time(client: httpx.Client) -> 
 
 
 def test_far_out_the_answer_is_finite_or_a_problem(client: httpx.Client) -> None:
-    answer = client.post(MESH, json={"latent": [-1.5, 1.0, 30.0]}, params={"format": "json"})
+    answer = client.post(MESH, json={"latent": [0.1, 0.1, 30.0]}, params={"format": "json"})
     assert np.isfinite(positions(answer)).all()
     diagnostics = json.loads(answer.headers["Shape-Diagnostics"])
-    assert diagnostics["residual"] > 0.01, "lengths can't be negative, so the residual must be large"
-    overflow = client.post(MESH, json={"latent": [3.4e38, 0.0, 0.0]})
-    assert overflow.status_code == 422
-    assert overflow.json()["type"].endswith("not-finite")
+    assert diagnostics["residual"] > 0.01, "no surface has such lengths and angles"
+    for code in ([-1.5, 1.0, 30.0], [3.4e38, 0.0, 0.0]):
+        refused = client.post(MESH, json={"latent": code})
+        assert refused.status_code == 422
+        assert refused.json()["type"].endswith("not-finite")
