@@ -67,8 +67,8 @@ class MeshChoice(StrEnum):
 class Decoder:
     """Networks and Gauss–Newton solvers of a bundle; any number of threads may use it.
 
-    Gauss–Newton begins at fixed starts, so a shape does not depend on earlier ones. If several codes are decoded at once,
-    their networks run together, except for full shapes. This changes the last digits.
+    Gauss–Newton begins at fixed starts, so a shape does not depend on earlier ones. If several codes are decoded at
+    once, their networks run together, except for full shapes. This changes the last digits.
 
     Up to ``threads`` shapes may be reconstructed at once, each with its own solver. The first solver is made here,
     others when they are needed, which takes about as long as a shape. Raises BundleError if a network doesn't load, or
