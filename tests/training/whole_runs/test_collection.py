@@ -437,7 +437,7 @@ def test_without_baselines_nothing_is_trained_for_comparison(copy: Run, monkeypa
         kinds == {"combiner", "factor-0", "factor-1"} == {k.rpartition("-")[0] for k in copy.directory.histories.read()}
     )
     found = copy.directory.evaluation.read()
-    assert found["r2"].keys() == {"composite", "kernel", "affine", "affine of learned factors"}
+    assert found["r2"].keys() == {"composite", "kernel", "affine", "affine of learned factors", "limit"}
     assert found["fresh"]["r2"].keys() == {"composite", "kernel"}
     assert copy.directory.report.exists()
 
