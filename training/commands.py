@@ -15,7 +15,7 @@ import click
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import DECODER, MANIFEST
-from shapespace.bundle.writer import add_decoder, amend_bundle
+from shapespace.bundle.writer import amend_bundle
 from shapespace.command_line import carry_out, near
 from shapespace.model.accuracy import measure_accuracy
 from shapespace.model.decoder import Decoder
@@ -212,6 +212,5 @@ def _complete(folder: Path) -> None:
     bundle = read_bundle(folder)
     decoder = Decoder(bundle)
     made = decoder_graph(bundle, decoder)
-    amend_bundle(folder, auto_error=measure_accuracy(decoder).auto_error)
-    add_decoder(folder, made)
+    amend_bundle(folder, made, auto_error=measure_accuracy(decoder).auto_error)
     print(f"{near(folder)} has {DECODER} now" if made.entry else f"{near(folder)} has no {DECODER}: {made.absent}")

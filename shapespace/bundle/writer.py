@@ -142,8 +142,10 @@ def write_bundle(models: Path, facts: Facts, networks: Networks, geometry: Geome
     return folder
 
 
-def amend_bundle(folder: Path, **members: Any) -> None:
+def amend_bundle(folder: Path, decoder: ExportedDecoder | None = None, **members: Any) -> None:
     """Replace members of the manifest of a bundle, such as ``auto_error``, and write its card, which it may not have.
+
+    A ``decoder`` replaces ``decoder.onnx``, or the reason why there is none. All networks stay.
 
     Raises:
         BundleError: there is no valid bundle. Nothing is written.
@@ -151,18 +153,13 @@ def amend_bundle(folder: Path, **members: Any) -> None:
         OSError: the folder can't be written.
     """
     bundle = read_bundle(folder)
+    files = read_files(folder, bundle.manifest)
     manifest = Manifest.model_validate(bundle.manifest.model_dump(by_alias=True) | members)
-    _replace(folder, read_files(folder, bundle.manifest), manifest, bundle)
-
-
-def add_decoder(folder: Path, decoder: ExportedDecoder) -> None:
-    """Write ``decoder.onnx`` into a bundle and its manifest; all networks stay. Raises BundleError or OSError."""
-    bundle = read_bundle(folder)
-    manifest = bundle.manifest
-    files = read_files(folder, manifest)
-    if manifest.decoder:
-        files.pop(manifest.decoder.file)
-    _replace(folder, files, _with_decoder(manifest, files, decoder), bundle)
+    if decoder:
+        if manifest.decoder:
+            files.pop(manifest.decoder.file)
+        manifest = _with_decoder(manifest, files, decoder)
+    _replace(folder, files, manifest, bundle)
 
 
 def _with_decoder(manifest: Manifest, files: dict[str, bytes], decoder: ExportedDecoder) -> Manifest:

@@ -82,10 +82,10 @@ class Decoder:
         self.reference, self.fine = bundle.reference, bundle.fine
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         self._surface = bundle.surface
-        self._overflow = (
-            f"The code lies so far outside the bounds that the model's numbers overflow. Choose a code "
-            f'nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
+        self._nearer = (
+            f'Choose a code nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
         )
+        self._overflow = f"The code lies so far outside the bounds that the model's numbers overflow. {self._nearer}"
         #: Tolerance of the quality ``auto``, and its measured error; None if ``auto`` answers full shapes.
         self.auto = manifest.auto_error
         codes = self.training_codes = bundle.training_codes
@@ -150,8 +150,8 @@ class Decoder:
         A draft comes from face frames. Where these are inconsistent, the shape is solved nevertheless. After the
         deadline Gauss–Newton stops with Status.DEADLINE. Outside the bounds ``auto`` takes at most ITERATIONS_OUTSIDE.
 
-        Raises NotFiniteError if the code is so far outside the bounds that numbers overflow or the predicted lengths
-        form no surface, and ModelFailedError if the networks failed at this code, or took too long.
+        Raises NotFiniteError if the code is far outside the bounds: numbers overflow, or no surface has the predicted
+        lengths. Raises ModelFailedError if the networks failed at this code, or took too long.
         """
         return next(self.shapes(code[None], [inside_bounds], mesh, deadline, quality, examples))
 
@@ -348,8 +348,7 @@ class Decoder:
             raise NotFiniteError(
                 f"The code lies so far outside the bounds that no surface has the predicted lengths: "
                 f"{broken.mean():.0%} of the triangles would have a side longer than the other two together. "
-                f"Choose a code nearer to the bounds, which the card of {self.manifest.name} lists, or send "
-                f'"bounds": "clamp".'
+                f"{self._nearer}"
             )
 
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:

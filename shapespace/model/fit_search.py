@@ -145,7 +145,7 @@ class FitSearch:
         return replace(state, sigma=sigma, cost=cost, derivatives=self._last)
 
     def with_moved_feature(self, state: FitState, features: FeatureSearch, steps: int) -> FitState:
-        """Move a feature to its most promising place in the scan, as long as the fit improves with so many steps."""
+        """Move a feature to its most promising place in the scan and take steps, as long as this improves the fit."""
         for _ in features.images:
             code = features.another(self._reconstruct, state.code, self._pairs(state), self.constraints.movable)
             begun = None if code is None else self.start(code, state.placement, state.shape)

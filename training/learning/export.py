@@ -148,12 +148,12 @@ def export(
     try:
         # Shapes are measured as they are served, which needs a bundle: a first one in a temporary folder.
         with TemporaryDirectory() as folder:
-            first = write_bundle(Path(folder), facts, networks, geometry)
-            decoder = Decoder(read_bundle(first))
+            first = read_bundle(write_bundle(Path(folder), facts, networks, geometry))
+            decoder = Decoder(first)
             accuracy = measure_accuracy(decoder)
             facts = replace(facts, draft_error=accuracy.draft_error, auto_error=accuracy.auto_error)
             if settings.decoder:
-                networks = replace(networks, decoder=decoder_graph(read_bundle(first), decoder))
+                networks = replace(networks, decoder=decoder_graph(first, decoder))
         return write_bundle(models, facts, networks, geometry)
     except ValidationError as error:
         fault = error.errors(include_url=False, include_input=False)[0]

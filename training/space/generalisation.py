@@ -99,6 +99,11 @@ def folds(count: int) -> list[IntArray]:
     return [np.arange(fold, count, parts) for fold in range(parts)]
 
 
+def many_steps(first_step: FirstStep) -> int:
+    """Return K of exponentials that bend, where the settings leave it open."""
+    return LIGHT_STEPS if first_step == "centred" else STEPS
+
+
 def time_steps(
     settings: ModeSettings,
     reference: TriangleMesh,
@@ -119,7 +124,7 @@ def time_steps(
     """
     if settings.log_steps != "auto":
         return settings.log_steps
-    many = LIGHT_STEPS if first_step == "centred" else STEPS
+    many = many_steps(first_step)
     original_index = np.arange(len(shapes)) if original_index is None else original_index
     count = int(original_index.max()) + 1
     if count < FOLDS:  # too few to choose

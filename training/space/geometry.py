@@ -26,8 +26,8 @@ from shapespace.training.space.generalisation import (
     FOLDED_SHARE,
     FOLDS,
     LIGHT_STEPS,
-    STEPS,
     folds,
+    many_steps,
     space_of,
     time_steps,
     vertex_distances,
@@ -101,7 +101,7 @@ def _many(settings: ModeSettings, first_step: FirstStep) -> int:
     """Return K of exponentials, which bend."""
     if settings.log_steps != "auto":
         return settings.log_steps
-    return LIGHT_STEPS if first_step == "centred" else STEPS
+    return many_steps(first_step)
 
 
 def straight_count(settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray) -> int:

@@ -12,7 +12,7 @@ after the other is solved, and the objective never rises.
   metric, scaled to weigh as much as M on the logarithms. Then z is a soft threshold. The matrix is factorised once: it
   is the same for all modes and iterations, because the penalty G is scaled with |w_j|² like the other terms. A few
   iterations are enough, because z and its multiplier are kept.
-- Modes that hardly overlap are solved together, which takes half the time. If their sum raises the objective, they all
+- Modes with little overlap are solved together, which takes half the time. If their sum raises the objective, they all
   go a part of the way. The objective is convex in all modes, so at 1/k of the way of k modes it does not rise.
 - W is least squares in a box, a small problem for each shape, solved by coordinate descent.
 
@@ -248,7 +248,7 @@ def _alternate(
 
 
 def _groups(gram: FloatArray, W: FloatArray) -> list[IntArray]:
-    """Divide the modes into groups that are solved together, each of modes that are hardly coupled.
+    """Divide the modes into groups that are solved together, each of modes with little coupling.
 
     The coupling of two modes is the cosine of their coefficients times the cosine of their fields, without signs; the
     ``gram`` matrix (m, m) has the inner products of the fields. Modes without coefficients are left out.

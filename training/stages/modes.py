@@ -1,13 +1,15 @@
 """Stage `modes`: logarithms of the shapes at the mean, their sparse and principal modes, and codes of the shapes."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.codes import box_of, enough_steps, nearest_codes
+from shapespace.training.space.codes import Codes, box_of, enough_steps, nearest_codes
 from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count, pga
@@ -26,7 +28,6 @@ def decompose(run: Run) -> None:
         return
     settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()
     shapes, original_index = given["vertices"], given["original"]
-    originals = original_index.max() + 1
     space = ShellSpace(centre, config.shell_material, first_step=config.exponential.first_step)
     norm = WeightedNorm.of(centre, config.material.eta)
     steps = directory.log_steps()
@@ -38,23 +39,15 @@ def decompose(run: Run) -> None:
     if settings.log_steps == "auto" and space.first_step == "centred" and steps > 1:
         shooting = enough_steps(space, centre.vertices, sparse.vertices, sparse.coefficients)
     codes = nearest_codes(space, centre.vertices, sparse.vertices, shapes, sparse.coefficients, shooting)
-    lower, upper = box_of(codes.codes)
     arrays = {
         "nric": sparse.nric,
         "vertices": sparse.vertices,
-        "coefficients": codes.codes[:originals],
-        "mirrored_coefficients": codes.codes[originals:],
-        "lower": lower,
-        "upper": upper,
         "localisation": localisation(sparse.nric, norm),
         "pga_nric": dense.nric,
         "pga_vertices": dense.vertices,
         "pga_localisation": localisation(dense.nric, norm),
     }
-    directory.modes_by_strength.write(**arrays)
-    directory.modes.write(**arrays, rank=np.arange(len(sparse)))
-    away = vertex_distances(codes.vertices, shapes, directory.reference_mesh().diagonal)[:originals]
-    facts: dict[str, Any] = {
+    facts = {
         "modes": len(sparse),
         "converged": sparse.converged,
         "explained": sparse.explained,
@@ -66,35 +59,24 @@ def decompose(run: Run) -> None:
         "exponential_steps": shooting,
         "steps": list(found.steps),
         "via": list(found.via),
-        "codes": [str(status) for status in codes.status],
-        "left": summary(away),
     }
-    directory.decomposition.write(facts | {"reasons": list(found.reasons), "history": sparse.history})
-    directory.log("found", **facts)
+    _write(directory, arrays, codes, facts, reasons=list(found.reasons), history=sparse.history)
 
 
 def _straighten(run: Run) -> None:
     """Write the same files for straight lines. Their modes are principal, and need no logarithm."""
-    directory, given, chosen = run.directory, run.directory.shapes.read(), run.directory.geometry.read()
-    shapes, originals, centre = given["vertices"], int(given["original"].max()) + 1, directory.mean_mesh()
+    directory, chosen = run.directory, run.directory.geometry.read()
+    shapes, centre = directory.shapes.read()["vertices"], directory.mean_mesh()
     every = StraightLines.of(chosen["kind"], shapes, directory.reference_mesh())
     lines = every.first(chosen["count"])
-    found = lines.nearest(shapes)
-    lower, upper = box_of(found.codes)
     arrays = {
         "nric": lines.nric,
         "vertices": lines.fields,
         "mean": lines.mean,
-        "coefficients": found.codes[:originals],
-        "mirrored_coefficients": found.codes[originals:],
-        "lower": lower,
-        "upper": upper,
         "localisation": localisation(lines.nric, WeightedNorm.of(centre, run.config.material.eta)),
     }
-    directory.modes_by_strength.write(**arrays)
-    directory.modes.write(**arrays, rank=np.arange(len(lines)))
     explained = float(every.explained[: len(lines)].sum())
-    facts: dict[str, Any] = {
+    facts = {
         "modes": len(lines),
         "converged": True,
         "explained": explained,
@@ -104,11 +86,25 @@ def _straighten(run: Run) -> None:
         "asked": chosen["count"],
         "log_steps": 1,
         "steps": [1] * len(shapes),
-        "codes": [str(status) for status in found.status],
-        "left": summary(vertex_distances(found.vertices, shapes, directory.reference_mesh().diagonal)[:originals]),
     }
-    directory.decomposition.write(facts | {"history": []})
-    directory.log("found", **facts)
+    _write(directory, arrays, lines.nearest(shapes), facts, history=[])
+
+
+def _write(
+    directory: RunDirectory, arrays: Mapping[str, NDArray], found: Codes, facts: Mapping[str, Any], **details: Any
+) -> None:
+    """Write modes, the codes of the shapes with their bounds, and facts. ``details`` are too long for the log."""
+    given = directory.shapes.read()
+    shapes, originals = given["vertices"], int(given["original"].max()) + 1
+    lower, upper = box_of(found.codes)
+    coefficients = {"coefficients": found.codes[:originals], "mirrored_coefficients": found.codes[originals:]}
+    every = {**arrays, **coefficients, "lower": lower, "upper": upper}
+    directory.modes_by_strength.write(**every)
+    directory.modes.write(**every, rank=np.arange(len(every["nric"])))
+    away = vertex_distances(found.vertices, shapes, directory.reference_mesh().diagonal)[:originals]
+    told = {**facts, "codes": [str(status) for status in found.status], "left": summary(away)}
+    directory.decomposition.write(told | details)
+    directory.log("found", **told)
 
 
 def _warnings(run: RunDirectory) -> list[StageWarning]:

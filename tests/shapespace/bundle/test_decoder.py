@@ -10,7 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import DECODER, DecoderEntry
-from shapespace.bundle.writer import ExportedDecoder, add_decoder
+from shapespace.bundle.writer import ExportedDecoder, amend_bundle
 from tests.service.bundles import reference, seal, write_bundle
 
 
@@ -48,7 +48,7 @@ def folder(tmp_path: Path) -> Path:
     path = write_bundle(tmp_path / "models")
     assert read_bundle(path).manifest.decoder is None
     entry = DecoderEntry(file=DECODER, input="latent", vertices="vertices", misfit="misfit", error=1e-5)
-    add_decoder(path, ExportedDecoder(linear().SerializeToString(), entry))
+    amend_bundle(path, ExportedDecoder(linear().SerializeToString(), entry))
     assert read_bundle(path).manifest.decoder == entry
     return path
 
