@@ -38,8 +38,6 @@ RENEWALS = Renewals()
 #: Most steps of exact Newton: 4 to 8 suffice where it converges, beyond, a face collapses (posed bodies). Smallest step
 #: length of its line search.
 NEWTON_STEPS, SMALLEST_STEP = 12, 1 / 16
-#: Most first steps that are tried to find the velocity of a geodesic.
-CENTRING = 40
 
 
 def exponential(
@@ -110,25 +108,21 @@ def centred_step(space: ShellSpace, start: FloatArray, stride: FloatArray, toler
 def velocity_of(path: DiscretePath, tolerance: float = TOLERANCE) -> FloatArray | None:
     """Find the velocity (V, 3) whose exponential is a geodesic: the inverse of the first step.
 
-    For a centred step this is a fixed point: the stride d/K changes by the miss of X_1. The miss shrinks by a factor
-    like 1/K, and Anderson's method accelerates it. Returns None if it doesn't converge, because steps are too long.
+    The shapes before and after the start of a centred step lie symmetrically about X_1, so one equation for the shape
+    after it gives both. Returns None if it has no solution, because steps are too long.
     """
     space, start, steps = path.space, path.vertices[0], len(path.vertices) - 1
     wanted = align(path.vertices[1], start)
     stride = without_rigid_motion(wanted - start, start)
     if space.first_step == "paper" or steps == 1:
         return steps * stride
-    mixing, norm = Anderson(), space.point(start)
-    for _ in range(CENTRING):
-        step = centred_step(space, start, stride, tolerance)
-        if not step.converged:
-            return None
-        miss = without_rigid_motion(wanted - step.vertices[-1], start)
-        forces = norm.pull_back(norm.lower(norm.push_forward(miss)))
-        if not step_length(forces, miss) > tolerance:
-            return steps * (stride + miss)
-        stride = mixing(stride, forces, miss)
-    return None
+    try:
+        solution = _Renewal(space).solve(_CentredStep(space.point(start), stride), start + stride, tolerance)
+    except NotPositiveDefiniteError:
+        return None
+    if not solution.converged:
+        return None
+    return steps * without_rigid_motion(start + 2 * stride - solution.point.vertices, start)
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
@@ -199,7 +193,7 @@ class _Renewal:
         self._when_new = self._excess = 0
         self._rotates = False
 
-    def solve(self, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
+    def solve(self, equation: _Equation, start: FloatArray, tolerance: float) -> _Solution:
         """Solve one step, with the old factor if possible. Raises NotPositiveDefiniteError."""
         wasted = 0
         if self._factor is not None:
@@ -214,7 +208,9 @@ class _Renewal:
             solution = _newton(equation, chord, tolerance)
         return replace(solution, iterations=wasted + solution.iterations)
 
-    def _with_old_factor(self, factor: ChordSolver, equation: _Step, start: FloatArray, tolerance: float) -> _Solution:
+    def _with_old_factor(
+        self, factor: ChordSolver, equation: _Equation, start: FloatArray, tolerance: float
+    ) -> _Solution:
         chord = factor.rotated_to(equation.current) if self._rotates else factor
         # The matrix of the factor may differ from the matrix of the step by about a factor of 2.
         solution = _chord(equation, chord, start, tolerance / 2, self._when_new + RENEWALS.cost)
@@ -268,6 +264,34 @@ class _Step:
         return sparse.csc_array(derivative + shift * sparse.eye_array(derivative.shape[0]))
 
 
+class _CentredStep:
+    """The equation of a centred first step, for the shape X after ``X_0 − s`` and X_0 with ``s + X − X_0 = 2 stride``.
+
+    Both neighbours of X_0 move with X, so F is half the sum of a forward and a backward step's forces. Then
+    ``DF(X) ≈ −A`` as there.
+    """
+
+    def __init__(self, start: ShellPoint, stride: FloatArray) -> None:
+        self.current = start
+        self._stride = stride
+
+    def _both(self, unknown: ShellPoint) -> tuple[tuple[_Step, ShellPoint], tuple[_Step, ShellPoint]]:
+        before = self.current.space.point(unknown.vertices - 2 * self._stride)
+        return (_Step(before, self.current, True), unknown), (_Step(unknown, self.current, False), before)
+
+    def forces(self, unknown: ShellPoint) -> FloatArray:
+        """Compute F (V, 3)."""
+        (forward, after), _ = self._both(unknown)
+        return forward.forces(after) / 2
+
+    def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
+        """Compute ``DF(X)`` (3V, 3V)."""
+        return sparse.csc_array(sum(step.derivative(shape) for step, shape in self._both(unknown)) / 2)
+
+
+_Equation = _Step | _CentredStep
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Solution(Outcome):
     """The result of an iteration on one step."""
@@ -275,7 +299,7 @@ class _Solution(Outcome):
     point: ShellPoint
 
 
-def _accepted(equation: _Step, point: ShellPoint, iterations: int, residual: float) -> _Solution:
+def _accepted(equation: _Equation, point: ShellPoint, iterations: int, residual: float) -> _Solution:
     """Check that a solution of the equation is a deformation of the present shape."""
     fault = fault_between(equation.current, point)
     status = Status.DEGENERATE if fault else Status.CONVERGED
@@ -287,7 +311,7 @@ def _stalled(point: ShellPoint, iterations: int, residual: float, reason: str) -
 
 
 def _chord(
-    equation: _Step, chord: ChordSolver, start: FloatArray, tolerance: float, limit: float = np.inf
+    equation: _Equation, chord: ChordSolver, start: FloatArray, tolerance: float, limit: float = np.inf
 ) -> _Solution:
     """Iterate ``X ← X + A⁻¹F(X)`` with a fixed factor, accelerated, until it converges or slows down.
 
@@ -312,7 +336,7 @@ def _chord(
         x = mixing(x, forces, step)
 
 
-def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
+def _newton(equation: _Equation, chord: ChordSolver, tolerance: float) -> _Solution:
     """Solve by exact Newton with a line search, from the present shape. A factor measures the residuals."""
     point, forces, residual = equation.current, *_measured(equation, chord, equation.current)
     for iteration in range(NEWTON_STEPS + 1):
@@ -331,13 +355,13 @@ def _newton(equation: _Step, chord: ChordSolver, tolerance: float) -> _Solution:
     return _stalled(point, NEWTON_STEPS, residual, f"Newton is slow, residual {residual:.1e}")
 
 
-def _measured(equation: _Step, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
+def _measured(equation: _Equation, chord: ChordSolver, point: ShellPoint) -> tuple[FloatArray, float]:
     forces = equation.forces(point)
     return forces, step_length(forces, chord.solve(forces))
 
 
 def _line_search(
-    equation: _Step, chord: ChordSolver, point: ShellPoint, step: FloatArray, residual: float
+    equation: _Equation, chord: ChordSolver, point: ShellPoint, step: FloatArray, residual: float
 ) -> tuple[ShellPoint, FloatArray, float] | None:
     """Find a share t of a step that reduces the residual by t/4 or more; returns shape, F and residual there."""
 
