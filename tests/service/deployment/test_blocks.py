@@ -29,6 +29,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from shapespace.model.shape_model import load
 from shapespace.service.settings import PREFIX, Settings
+from shapespace.training.runs.config import parse
 from tests.long.__main__ import TESTS
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
@@ -126,6 +127,11 @@ def try_shell(text: str, server: Server, folder: Path) -> None:
             try_command(line.partition("#")[0])
 
 
+def try_configuration(text: str, server: Server, folder: Path) -> None:
+    """The only TOML on the pages is a configuration of a run."""
+    assert parse(text, "the page").collection.data
+
+
 def try_python(text: str, server: Server, folder: Path) -> None:
     (folder / "models").symlink_to(ROOT / "models")
     run([sys.executable, "-c", text], server, folder)
@@ -186,6 +192,7 @@ def try_drawing(text: str, server: Server, folder: Path) -> None:
 
 TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
     "sh": try_shell,
+    "toml": try_configuration,
     "python": try_python,
     "js": try_javascript,
     "json": try_log_line,
