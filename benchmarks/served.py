@@ -97,7 +97,8 @@ drawn evenly from the bounds, in the first fold.
 - No fold chose by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with some of them in view.
 - `python -m benchmarks.served --data FOLDER` trains, measures and writes this page. Figures are in
-  `runs/collections/`."""
+  `runs/collections/`.
+"""
 
 
 def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, FloatArray, FloatArray]:
