@@ -52,9 +52,9 @@ this limb, so it is within reach. `python -m benchmarks.edit` measures and write
 
 ## Errors and times
 
-`encode` finds codes almost exactly, in the time of 10 to 22 full shapes. `edit` mostly reaches its targets within 1 %, in
-the time of 24 to 31 shapes when one edit follows another. **A single edit takes 44 to 85 shapes**, or 30 to 140 if a target
-is out of reach.
+`encode` finds codes almost exactly, and `edit` mostly reaches its targets within 1 %. Both take as long as 10 to 31
+full shapes. Targets out of reach take longer: 44 shapes of the figure and 32 of the torus at the median, and single
+edits of the torus up to 380 (12 edits each, November 2026).
 
 | | median error | largest | over 1 % | time, in shapes |
 |---|---|---|---|---|
