@@ -31,8 +31,8 @@ How exact and how fast are `edit` and `encode`, and what else does an edit move?
 
 ## What an edit moves
 
-If you pull a fingertip, an elbow or a knee of the figure (1.7 m tall), the limb follows, and the other limbs and the
-head move {mean} mm on average, {most} mm in the worst pull.
+If you pull a fingertip, an elbow or a knee of the figure (1.7 m tall), the limb follows. The other limbs and the head
+move {mean} mm on average, {most} mm in the worst pull.
 
 | `prior_kind` | others move (mm) | target is missed by | factors that change | shapes computed |
 |---|---|---|---|---|
@@ -53,8 +53,8 @@ this limb, so it is within reach. `python -m benchmarks.edit` measures and write
 ## Errors and times
 
 `encode` finds codes almost exactly, and `edit` mostly reaches its targets within 1 %. Both take as long as 10 to 31
-full shapes. Targets out of reach take longer: 44 shapes of the figure and 32 of the torus at the median, and single
-edits of the torus up to 380 (12 edits each, November 2026).
+full shapes. Targets out of reach take 44 shapes of the figure and 32 of the torus at the median (12 edits each,
+November 2026). One edit of the torus with five targets took 380.
 
 | | median error | largest | over 1 % | time, in shapes |
 |---|---|---|---|---|

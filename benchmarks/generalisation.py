@@ -38,8 +38,8 @@ is the number of [time steps](../reference/glossary.md#time-steps). {measured}
 
 ## Modes and principal components
 
-With all modes, the error is {gain} of the error of as many principal components for {better}, and {rest} for the
-others.
+With all modes, the error is {gain} of the error of as many principal components for {better}. For the
+others it is {rest}.
 
 {plain}
 
