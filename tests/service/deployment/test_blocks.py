@@ -105,6 +105,8 @@ def try_command(line: str) -> None:
             assert isinstance(command, Subcommand)
             with suppress(click.exceptions.Exit):  # of --help
                 command.make_context(words[0], words[1:] or ["--help"])
+        case "source":
+            assert words == [".venv/bin/activate"]  # as the Makefile makes it
         case "npm":
             assert words == ["install", "onnxruntime-web"]  # try_javascript has its runtime
         case "python" if words[0] == "-m":
