@@ -40,7 +40,7 @@ MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 #: Blocks that are not tested, by page and first line, and why.
 UNTRIED = {
-    ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
+    ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 127.0.0.1:8000:8000 shapespace"): (
         "needs a container engine; `make long image-test` builds and tries the same"
     ),
     ("docs/how-to/collections.md", "pip install 'shapespace[train,people]'"): (
