@@ -40,13 +40,14 @@ MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 #: Blocks that are not tested, by page and first line, and why.
 UNTRIED = {
-    ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 127.0.0.1:8000:8000 shapespace"): (
-        "needs a container engine; `make long image-test` builds and tries the same"
-    ),
-    ("docs/how-to/collections.md", "pip install 'shapespace[train,people]'"): (
+    (
+        "docs/how-to/serve.md",
+        "docker build -t shapespace . && docker run --rm --read-only -p 127.0.0.1:8000:8000 shapespace",
+    ): ("needs a container engine; `make long image-test` builds and tries the same"),
+    ("docs/how-to/collections.md", "pip install '.[people]'"): (
         "installs 500 MB and trains for more than an hour; `make long people` makes the same bodies"
     ),
-    ("docs/how-to/gpu.md", "pip install --force-reinstall --no-deps torch==2.13.0 --index-url INDEX"): (
+    ("docs/how-to/gpu.md", ".venv/bin/pip install --force-reinstall torch==2.13.0 --index-url INDEX"): (
         "needs a GPU and an index of PyTorch"
     ),
     ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the block above it sends the same request",
@@ -111,6 +112,8 @@ def try_command(line: str) -> None:
             assert words == ["install", "onnxruntime-web"]  # try_javascript has its runtime
         case "python" if words[0] == "-m":
             assert importlib.util.find_spec(words[1]), words[1]
+        case "python" if words[0] == "-c":
+            compile(words[1], line, "exec")
         case "dask":
             dask = Path(sys.executable).with_name("dask")
             told = subprocess.run([dask, words[0], "--help"], capture_output=True, text=True, check=True).stdout
