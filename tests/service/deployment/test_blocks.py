@@ -221,6 +221,7 @@ def test_a_new_version_is_rolled_out_and_back_as_the_page_says(tmp_path: Path) -
         with httpx.Client(base_url=server.url, timeout=60) as client:
             for line in "".join(block.text for block in ROLLOUT).splitlines():
                 if "grep" in line and "requests" in line:
+                    eventually(lambda: 'version="4"} 0.05' in client.get("/metrics").text, seconds=60)
                     found = [client.get("/v1/models/figure/mesh", params={"latent": code}) for code in codes]
                     answered += [Counter(answer.headers["Model-Version"] for answer in found)]
 
