@@ -39,10 +39,9 @@ def save_small(page: Page, path: Path) -> None:
 
 def first_model(folder: Path) -> None:
     """Take the screenshots of the first tutorial: the head of its report, and the page with its model."""
-    size = {"width": 1100, "height": 690}
     with server(folder / "models") as (client, *_), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport=size)
+        page = browser.new_page(viewport={"width": 1100, "height": 690})
         page.goto((folder / "runs" / "meshes" / "report.html").resolve().as_uri())
         save_small(page, DOCS / "tutorial" / "report.webp")
         page.goto(f"{client.base_url}#model=meshes&z={BENT}")
