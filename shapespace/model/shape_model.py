@@ -53,7 +53,7 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
 
     >>> import shapespace
     >>> shapespace.load("figure")
-    <ShapeModel figure/3: 20 coordinates, 10 factors, 4601 vertices>
+    <ShapeModel figure/4: 20 coordinates, 10 factors, 4601 vertices>
     """
     return ShapeModel(read_bundle(find_bundle(folder)), threads)
 

@@ -86,7 +86,7 @@ def test_frames_come_without_the_memory_of_training_shapes(client: httpx.Client,
 
 def strengthened(factor: float) -> Decoder:
     """The figure with a memory that corrects so many times as much."""
-    bundle = read_bundle(ROOT / "models/figure/3")
+    bundle = read_bundle(ROOT / "models/figure/4")
     file = bundle.manifest.combiner.file
     model = onnx.load_model_from_string(bundle.networks[file])
     graph = model.graph

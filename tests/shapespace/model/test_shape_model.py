@@ -166,7 +166,7 @@ def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, mo
     assert load("figure").folder == BUNDLED / "figure" / "3"
     (tmp_path / "figure").mkdir()  # a folder of meshes, say
     (tmp_path / "models" / "odd").mkdir(parents=True)
-    assert load("figure/3").manifest.name == "figure"
+    assert load("figure/4").manifest.name == "figure"
     shutil.copytree(models / "small", tmp_path / "models" / "small")
     write_bundle(tmp_path / "models", "figure", "7")
     listed = shapespace.models()
@@ -176,7 +176,7 @@ def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, mo
     for unknown in ("figur", "small/3"):
         with pytest.raises(BundleError, match=f"no model {unknown} here: choose among figure, freaky-torus, small, or"):
             load(unknown)
-    for folder in ("models/figur", "../figure", "figure/3/4"):
+    for folder in ("models/figur", "../figure", "figure/4/5"):
         with pytest.raises(BundleError, match="can't be read: there is no such file or folder"):
             load(folder)
     monkeypatch.setattr(finding, "BUNDLED", tmp_path / "none")
