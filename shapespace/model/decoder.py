@@ -326,10 +326,12 @@ class Decoder:
         return fine.nearby if fine else np.ones(len(self.reference.vertices))
 
     def targets(self, codes: Codes, examples: Examples, quality: Quality = Quality.FULL) -> FloatArray:
-        """Return combined NRIC (n, 2E), with the memory of training shapes as wanted; of frames of one of `frames`."""
+        """Return combined NRIC (n, 2E), with the memory of training shapes as wanted."""
         if isinstance(examples, Fade):
             if self.remembers:
-                return on_segment(lambda *rows: self._networks(*rows)[1], codes, examples, quality is not Quality.FULL)
+                run, several = lambda *rows: self._networks(*rows)[1], self._answered(quality) is not Quality.FULL
+                ranges = self.frames(codes, quality, examples)
+                return np.concatenate([on_segment(run, codes[some], examples[some], several) for some in ranges])
             examples = True
         factor = None if examples or not self.remembers else np.zeros((1, 1), np.float32)
         return self._networks(codes, factor)[1]

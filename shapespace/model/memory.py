@@ -84,21 +84,21 @@ def switched(content: bytes) -> bytes | None:
     return bytes(model.SerializeToString())
 
 
-def on_segment(networks: Callable[..., FloatArray], codes: Codes, fade: Fade, filled: bool) -> FloatArray:
+def on_segment(networks: Callable[..., FloatArray], codes: Codes, fade: Fade, several: bool) -> FloatArray:
     """Return the NRIC (n, 2E) of frames (n, m) on one segment. A keyframe has the bytes of its code alone.
 
     Args:
         networks: NRIC (k, 2E) of codes (k, m), without or with the memory by factors (k, 1), 0 or 1.
         codes: codes of the frames of one of `Fade.runs`, or of one frame.
         fade: the same frames.
-        filled: whether runs have FRAMES_PER_RUN rows for frames, and each frame its row. Otherwise there is one row.
+        several: whether runs have FRAMES_PER_RUN rows for frames, and each frame its row. Otherwise there is one row.
     """
     keyframes = np.isin(fade.share, (0, 1))
     alone = [networks(code[None])[0] if key else None for code, key in zip(codes, keyframes, strict=True)]
     if keyframes.all():
         return np.stack(alone)
-    row = fade.row if filled else np.zeros(len(codes), dtype=np.int64)
-    rows = np.repeat(codes[:1], FRAMES_PER_RUN if filled else 1, axis=0)
+    row = fade.row if several else np.zeros(len(codes), dtype=np.int64)
+    rows = np.repeat(codes[:1], FRAMES_PER_RUN if several else 1, axis=0)
     rows[row] = codes
     ends = np.stack([fade.first[0], fade.first[0], fade.last[0], fade.last[0]])
     factors = np.array([0] * len(rows) + [0, 1, 0, 1], np.float32)[:, None]
