@@ -165,10 +165,8 @@ class Decoder:
         return (slice(k, k + size) for k in range(0, len(codes), size))
 
     def frames(self, codes: Codes, quality: Quality, memory: Examples) -> Iterator[slice]:
-        """Yield ranges of frames with codes (n, m) for which networks run at once. A frame alone has the same bytes.
-
-        The run of a frame always has as many rows, and the frame always the same row. Only models with a memory need
-        further rows for each segment; others run for each frame, as for its code alone.
+        """Yield ranges of frames with codes (n, m) for which networks run at once. A frame alone has the same bytes:
+        its run has as many rows, and it has the same row. Without a memory, each frame has a run of its own.
         """
         if isinstance(memory, Fade) and self.remembers and self._answered(quality) is not Quality.FULL:
             return memory.runs()
@@ -213,8 +211,10 @@ class Decoder:
         found = None
         with self.solver() as reconstruct:
             if quality is not Quality.FULL:
-                tolerance = self.auto.tolerance if self.auto and quality is Quality.AUTO else None
-                found = reconstruct.draft(target, tolerance, deadline)
+                auto = self.auto if quality is Quality.AUTO else None
+                found = reconstruct.draft(
+                    target, *((auto.tolerance, auto.draft_misfit) if auto else ()), deadline=deadline
+                )
             if found is None:
                 quality = Quality.FULL if quality is Quality.DRAFT else quality
                 limit = MAX_ITERATIONS if inside_bounds or quality is Quality.FULL else ITERATIONS_OUTSIDE
