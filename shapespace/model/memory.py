@@ -94,9 +94,9 @@ def on_segment(networks: Callable[..., FloatArray], codes: Codes, fade: Fade, se
         several: whether runs have FRAMES_PER_RUN rows for frames, and each frame its row. Otherwise there is one row.
     """
     keyframes = np.isin(fade.share, (0, 1))
-    alone = [networks(code[None])[0] if key else None for code, key in zip(codes, keyframes, strict=True)]
+    alone = {k: networks(codes[k : k + 1])[0] for k in np.flatnonzero(keyframes)}
     if keyframes.all():
-        return np.stack(alone)
+        return np.stack([*alone.values()])
     row = fade.row if several else np.zeros(len(codes), dtype=np.int64)
     rows = np.repeat(codes[:1], FRAMES_PER_RUN if several else 1, axis=0)
     rows[row] = codes
@@ -106,4 +106,6 @@ def on_segment(networks: Callable[..., FloatArray], codes: Codes, fade: Fade, se
     first, with_first, last, with_last = z[-4:]
     share = fade.share[:, None]
     found: FloatArray = z[row] + (1 - share) * (with_first - first) + share * (with_last - last)
-    return np.stack([inner if own is None else own for inner, own in zip(found, alone, strict=True)])
+    for k, own in alone.items():
+        found[k] = own
+    return found
