@@ -190,7 +190,8 @@ class Decoder:
         whole = isinstance(examples, bool)
         for some in self.batches(codes, quality) if whole else self.frames(codes, quality, examples):
             began = time.perf_counter()
-            targets = self.targets(codes[some], examples if whole else examples[some], quality)
+            memory = examples if isinstance(examples, bool) else examples[some]
+            targets = self.targets(codes[some], memory, quality)
             seconds = (time.perf_counter() - began) / len(targets)
             for code, target, inside in zip(codes[some], targets, inside_bounds[some], strict=True):
                 yield self._solved(code, target, bool(inside), mesh, deadline, quality, seconds)
@@ -212,9 +213,8 @@ class Decoder:
         with self.solver() as reconstruct:
             if quality is not Quality.FULL:
                 auto = self.auto if quality is Quality.AUTO else None
-                found = reconstruct.draft(
-                    target, *((auto.tolerance, auto.draft_misfit) if auto else ()), deadline=deadline
-                )
+                tolerance, good_misfit = (auto.tolerance, auto.draft_misfit) if auto else (None, 0.0)
+                found = reconstruct.draft(target, tolerance, good_misfit, deadline)
             if found is None:
                 quality = Quality.FULL if quality is Quality.DRAFT else quality
                 limit = MAX_ITERATIONS if inside_bounds or quality is Quality.FULL else ITERATIONS_OUTSIDE
