@@ -188,7 +188,11 @@ RESULTS = {
 }
 
 
-@pytest.mark.parametrize("why", ["damaged", "missing"])
+#: What is missing is treated like what is damaged, and takes as long to make again.
+WHY = pytest.mark.parametrize("why", ["damaged", pytest.param("missing", marks=pytest.mark.long)])
+
+
+@WHY
 def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     why: str, config: Path, finished: Path, said: Said
 ) -> None:
@@ -209,7 +213,7 @@ def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     assert "again" not in said("status", finished) + said(*run)
 
 
-@pytest.mark.parametrize("why", ["damaged", "missing"])
+@WHY
 def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished: Path) -> None:
     models = finished / "models"
     bundle = models / "tiny-torus" / "1"
