@@ -135,7 +135,7 @@ new Look(store, viewer, find(".stage"));
 
 // The shape and its colours.
 store.on(["shape"], () => {
-  if (!store.shape) return;
+  if (!store.shape) return find(".stage").removeAttribute("data-shown");
   const { mesh, positions, placement, motion } = store.shape;
   viewer.show(
     mesh,
