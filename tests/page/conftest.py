@@ -19,6 +19,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 #: WebGL in software, which works on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
+#: Width and height of a window.
+SIZE = (1000, 640)
 #: A code of the small torus.
 CODE = (0.1, 1, 0.5)
 
@@ -54,8 +56,8 @@ def browser() -> Iterator[Browser]:
 
 
 def _opened(browser: Browser, url: str, options: dict[str, Any]) -> OpenPage:
-    size = {"width": 1000, "height": 640}
-    return OpenPage(browser.new_context(**{"viewport": size, "reduced_motion": "reduce", **options}).new_page(), url)
+    usual = {"viewport": dict(zip(("width", "height"), SIZE, strict=True)), "reduced_motion": "reduce"}
+    return OpenPage(browser.new_context(**{**usual, **options}).new_page(), url)
 
 
 @pytest.fixture
@@ -87,10 +89,10 @@ def visit(request: pytest.FixtureRequest, browser: Browser, server: Server, shar
     """
     failed, complaining = request.session.testsfailed, False
 
-    def visit(hash: str = "#model=with-fine", *, complains: bool = False) -> OpenPage:
+    def visit(hash: str = "#model=with-fine", *, size: tuple[int, int] = SIZE, complains: bool = False) -> OpenPage:
         nonlocal complaining
         complaining = complains
-        return shared[0].visit(hash)
+        return shared[0].visit(hash, size)
 
     yield visit
     studio = shared[0]

@@ -96,8 +96,10 @@ class OpenPage:
         self.rest()
         return self
 
-    def visit(self, hash: str) -> OpenPage:
-        """Show an address and wait until its full shape is drawn; on a loaded page as if it were new."""
+    def visit(self, hash: str, size: tuple[int, int]) -> OpenPage:
+        """Show an address in a window of a size until its full shape is drawn; on a loaded page as if it were new."""
+        width, height = size
+        self.page.set_viewport_size({"width": width, "height": height})
         if self.page.url == "about:blank":
             return self.open(hash)
         self.page.unroute_all(behavior="ignoreErrors")
@@ -116,14 +118,19 @@ class OpenPage:
 
     def require_calm(self, complains: bool) -> None:
         """Check that the page had no errors, unless it `complains`, and sent no requests to another host."""
-        assert self.foreign == []
-        assert complains or self.complaints == []
+        assert not self.foreign, self.foreign
+        assert complains or not self.complaints, self.complaints
 
     def rest(self) -> None:
         """Wait until the full shape, no draft, is drawn, on the fine mesh if the model has one."""
         fine = "document.querySelector('#fine')"
         script = f"{fine}.disabled || {fine}.getAttribute('aria-pressed') === 'false' ? 'coarse' : 'fine'"
-        self.eventually(lambda: (self.shown, self.quality) == (self.page.evaluate(script), "full"))
+        self.eventually(lambda: (self.shown, self.quality) == (self.page.evaluate(script), "full") and not self.waits)
+
+    def frames(self, count: int) -> None:
+        """Wait until the browser has drawn some frames: what was to happen has happened by then."""
+        script = "async (n) => { for (; n; n -= 1) await new Promise(requestAnimationFrame); }"
+        self.page.evaluate(script, count)
 
     @property
     def shown(self) -> str | None:
@@ -132,7 +139,7 @@ class OpenPage:
 
     @property
     def quality(self) -> str | None:
-        """Whether the drawn shape is a draft or full."""
+        """Whether the drawn shape is a draft or full; None after a change of the code, until a shape is drawn."""
         return self.page.locator(".stage").get_attribute("data-quality")
 
     @property
@@ -209,6 +216,12 @@ class OpenPage:
     def messages(self) -> str:
         """The page's messages to the user, including those no longer visible."""
         return self.page.locator("#messages").text_content() or ""
+
+
+def slow_down(page: Page) -> None:
+    """Give a page a line of 1 MB/s with a latency of 100 ms."""
+    line = {"offline": False, "latency": 100, "downloadThroughput": 1e6, "uploadThroughput": 1e6}
+    page.context.new_cdp_session(page).send("Network.emulateNetworkConditions", line)
 
 
 def pixels(png: bytes) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.page.conftest import Open
+from tests.page.conftest import Visit
 from tests.page.studio import pixels
 
 
@@ -11,8 +11,8 @@ from tests.page.studio import pixels
     ("width", "height", "least"),
     [(390, 844, 0.35), (640, 360, 0.45), (320, 568, 0.25), (1440, 900, 0.65), (844, 390, 0.45)],
 )
-def test_the_figure_is_large_and_nothing_lies_over_it(window: Open, width: int, height: int, least: float) -> None:
-    studio = window(viewport={"width": width, "height": height}).open("#model=figure")
+def test_the_figure_is_large_and_nothing_lies_over_it(visit: Visit, width: int, height: int, least: float) -> None:
+    studio = visit("#model=figure", size=(width, height))
     stage = studio[".stage"].bounding_box()
     assert stage
     assert stage["height"] >= 0.48 * height

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Route
 
 from shapespace.service.http.problems import KINDS
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import OpenPage, difference
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, Start
@@ -83,8 +83,8 @@ def test_back_goes_to_the_shape_before_and_to_the_model_before(window: Open) -> 
     studio.until_code([0.3, 0, 0.5])
 
 
-def test_errors_of_the_server_are_said_in_the_page(window: Open) -> None:
-    studio = window(complains=True).open()
+def test_errors_of_the_server_are_said_in_the_page(visit: Visit) -> None:
+    studio = visit(complains=True)
     before = studio.picture()
     refusal = json.dumps({"type": "urn:shapespace:problem:not-finite", "detail": "Send finite numbers for latents."})
 
@@ -288,5 +288,5 @@ def test_the_page_is_light_and_all_from_here(window: Open, server: Server) -> No
 
 def test_pixels_stay_when_nothing_happens(studio: OpenPage) -> None:
     first = studio.picture()
-    studio.page.wait_for_timeout(300)
+    studio.frames(10)
     assert difference(first, studio.picture()) == 0
