@@ -121,16 +121,22 @@ def test_every_problem_of_the_server_has_words_for_people(studio: OpenPage) -> N
 def test_a_server_that_went_away_and_comes_back(window: Open, start: Start, models: Path) -> None:
     port = free_port()
     server = start(models, port=port)
-    studio = window(server.url, complains=True).open()
-    before = studio.picture()
+    torus, figure = (window(server.url, complains=True).open(f"#model={name}") for name in ("with-fine", "figure"))
+    before, still = torus.picture(), figure.picture()
     server.stop()
-    studio.slide(0, 0.15)
-    studio.eventually(lambda: "does not answer" in studio.messages)
-    studio.slide(0, -0.15)
+    for studio in (torus, figure):
+        studio.slide(0, 0.15)
+        studio.eventually(lambda studio=studio: "does not answer" in studio.messages)
+        studio.slide(0, -0.15)
     start(models, port=port)
-    studio.eventually(lambda: "is back" in studio.messages and "does not answer" not in studio.messages)
-    assert studio.code[0] == pytest.approx(-0.15, abs=1e-3)
-    studio.eventually(lambda: covered(studio.picture()) < 0.9 * covered(before))
+    for studio in (torus, figure):
+        studio.eventually(
+            lambda studio=studio: "is back" in studio.messages and "does not answer" not in studio.messages
+        )
+        assert studio.code[0] == pytest.approx(-0.15, abs=1e-3)
+        studio.rest()
+    assert covered(torus.picture()) < 0.9 * covered(before)
+    assert difference(still, figure.picture()) > 0.003
 
 
 def covered(picture: np.ndarray) -> float:
