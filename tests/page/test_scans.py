@@ -1,5 +1,6 @@
 """Files not in correspondence: scans shown over the shape, verdicts, and undo."""
 
+import json
 import re
 from dataclasses import dataclass
 
@@ -46,6 +47,15 @@ class Given:
 def given(server: Server) -> Given:
     call = f"{server.url}/v1/models/figure/mesh?latent={','.join(map(str, CODE))}&format=npz"
     return Given(*read_arrays(httpx.get(call, timeout=60).raise_for_status().content, "npz"))
+
+
+#: Notes all values of the progress bar.
+WATCH_PROGRESS = """() => {
+    window.shares = [];
+    const bar = document.querySelector('#verdict progress');
+    const note = () => bar.hasAttribute('value') && window.shares.push(bar.value);
+    new MutationObserver((changes) => note()).observe(bar, { attributeFilter: ['value'] });
+}"""
 
 
 def choose(studio: OpenPage, file: object) -> None:
@@ -190,8 +200,13 @@ def test_a_fit_keeps_what_is_locked_and_can_be_given_up(visit: Visit, given: Giv
     studio.page.get_by_role("button", name="Cancel").click()
     assert studio["#verdict"].is_hidden()
     studio.page.unroute("**/fit?*")
+    studio.page.evaluate(WATCH_PROGRESS)
     choose(studio, given.file("points.xyz"))
     studio.eventually(lambda: studio["#verdict"].is_visible() and studio["#verdict progress"].is_hidden())
+    shares = studio.page.evaluate("shares")
+    assert len(shares) > 3, "the server tells how far it is"
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] < 1
     studio.page.get_by_role("button", name="Show what was found").or_(
         studio.page.get_by_role("button", name="Back to my shape")
     ).first.click()
@@ -203,7 +218,10 @@ def test_the_best_fit_at_the_time_limit_is_shown(visit: Visit, given: Given) -> 
 
     def late(route: Route) -> None:
         answer = route.fetch()
-        route.fulfill(response=answer, json=answer.json() | {"status": "deadline"})
+        *shares, found = (json.loads(event.removeprefix("data: ")) for event in answer.text().split("\n\n")[:-1])
+        assert [*shares[0]] == ["progress"]
+        told = json.dumps(found | {"status": "deadline"})
+        route.fulfill(response=answer, body=f"data: {told}\n\n")
 
     studio.page.route("**/fit?*", late)
     choose(studio, given.file("points.xyz"))
