@@ -211,7 +211,7 @@ def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_
     studio["#share"].click()  # which writes the address at once
     assert view()[0][1] >= view()[1][1] - 1e-4
 
-    studio.page.keyboard.press("0")
+    studio["#canvas"].press("0")
     studio.eventually(lambda: "view" not in studio.hash)
     studio["#theme"].focus()  # so that the canvas has no focus ring
     x, y = hand(studio)
