@@ -150,7 +150,10 @@ def test_ten_arrow_keys_are_one_step(studio: OpenPage) -> None:
     studio.eventually(lambda: "3 steps" in (studio["#undo"].get_attribute("title") or ""))
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 760), (500, 320), (320, 640), (1000, 640)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [(390, 760), (500, 320), *(pytest.param(*some, marks=pytest.mark.long) for some in ((320, 640), (1000, 640)))],
+)
 def test_legend_and_diagnostics_lie_apart(visit: Visit, width: int, height: int) -> None:
     studio = visit("#model=with-fine&z=0.4,0,2&colour=stretch", size=(width, height))
     studio.eventually(lambda: studio["#legend"].is_visible() and studio["#diagnostics li"].count() > 1)

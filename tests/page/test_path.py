@@ -149,7 +149,14 @@ def test_frames_that_never_come_are_told_and_can_be_asked_for_again(visit: Visit
     studio.until_code([0.2, 0, 1])
 
 
-@pytest.mark.parametrize("path", ["beyond=0", "beyond=0.25", "beyond=0.25&easing=soft", "show=loop&easing=soft"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "beyond=0.25&easing=soft",
+        "show=loop&easing=soft",
+        *(pytest.param(some, marks=pytest.mark.long) for some in ("beyond=0", "beyond=0.25")),
+    ],
+)
 def test_a_saved_path_goes_where_the_player_goes(visit: Visit, path: str) -> None:
     codes = "0,3,0;0.1,-2.7,1;-0.1,-2,0.5;0.2,1,0.2"
     studio = visit(f"#model=with-fine&z=0,0,0.7&keys={codes}&{path}")

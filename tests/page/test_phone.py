@@ -17,7 +17,7 @@ def sliders(studio: OpenPage) -> int:
     return int(studio[".coordinate input[type=range]"].evaluate_all(SLIDERS))
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (640, 400)])
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), pytest.param(640, 400, marks=pytest.mark.long)])
 def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: int) -> None:
     options = {"viewport": {"width": width, "height": height}, "has_touch": True, "is_mobile": width != 640}
     studio = window(**options).open("#model=figure")

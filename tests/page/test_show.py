@@ -201,6 +201,7 @@ def test_no_headset_no_button(studio: OpenPage) -> None:
     assert studio["#headset"].is_hidden()
 
 
+@pytest.mark.long  # the page waits for ten seconds
 def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -> None:
     studio = window().open()
     studio.page.evaluate(

@@ -115,13 +115,13 @@ export class Pull {
       this.#wanted = false;
       const { before, mesh, motion, there, positions } = this.#last;
       const { code } = before;
-      const { model, locked, pins } = this.store;
+      const { model, space, locked, pins } = this.store;
       const targets = this.#targets(pins, mesh, there);
       const began = awayFrom(targets, positions);
       try {
         const body = { latent: code, mesh, targets, anchored: true, fixed: fixedBy(locked, code) };
         const { latent, placement: place, residual, distances } = await api.edit(model, body);
-        if (this.store.model !== model) break;
+        if (this.store.space !== space) break; // another model, or the same one anew
         const follows = residual < NEARER * rootMeanSquare(began);
         // The rest of the shape stays, and the coarse shape keeps its position relative to the fine one.
         const placement = there.clone().multiply(matrixOf(place)).multiply(motion.clone().invert());
