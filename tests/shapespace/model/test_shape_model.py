@@ -163,7 +163,7 @@ def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert {"figure", "freaky-torus"} <= shapespace.models().keys()
-    assert load("figure").folder == BUNDLED / "figure" / "3"
+    assert load("figure").folder == BUNDLED / "figure" / "4"
     (tmp_path / "figure").mkdir()  # a folder of meshes, say
     (tmp_path / "models" / "odd").mkdir(parents=True)
     assert load("figure/4").manifest.name == "figure"
@@ -282,7 +282,7 @@ def ending_elsewhere(
 ) -> tuple[ShapeModel, NDArray]:
     """The figure, whose search by lengths and angles ends at the upper bounds, with residuals; and a training shape."""
     model, by_nric = load(models / "figure"), EncodeSearch._by_nric
-    codes = read_bundle(models / "figure" / "3").training_codes
+    codes = read_bundle(models / "figure" / "4").training_codes
     assert codes is not None
     given = model.decode(codes[20])
 
