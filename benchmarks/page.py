@@ -68,7 +68,7 @@ def first_shape(page: Page, url: str) -> float:
     page.emulate_media(reduced_motion="reduce")  # without this the shape would move by itself
     began = time.perf_counter()
     page.goto(url, wait_until="commit")
-    page.wait_for_selector(".stage[data-shown]")
+    page.wait_for_selector(".stage[data-shown]", timeout=120_000)
     return time.perf_counter() - began
 
 

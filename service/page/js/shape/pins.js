@@ -53,7 +53,8 @@ export class Pins {
       this.pull.take(this.store.pins[i], event);
     });
     button.addEventListener("click", (event) => {
-      const moved = event.detail > 0 && from && !isStill(from, event); // without detail, a key caused the click
+      // Without detail, a key caused the click.
+      const moved = event.detail > 0 && from && !isStill(from, event);
       if (!moved) this.#remove(i);
     });
     button.addEventListener("keydown", ({ key }) => {
