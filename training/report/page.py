@@ -134,6 +134,7 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
 GEOMETRIES = {
     "vertices": "straight lines of vertices",
     "nric": "straight lines of lengths and angles",
+    "differential": "straight lines of rotations and stretches",
     "exponential": "exponentials",
 }
 

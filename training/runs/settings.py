@@ -112,12 +112,13 @@ class ModeSettings(SettingsTable):
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
     mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
-    geometry: Literal["auto", "vertices", "nric", "exponential"] = "exponential"
+    geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
     """The map from codes to shapes. ``vertices`` moves every vertex along a straight line, so modes add up like blend
-    shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``exponential`` bends the surface as an
-    elastic shell. Straight lines are found in minutes: they have dense modes, one factor, and need neither ``norm``,
-    ``sparsity`` nor samples to learn from. ``auto`` takes the cheapest of the three whose error on held-out shapes is
-    at most 2 % above the least. ``init`` writes ``auto``."""
+    shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential`` does it with rotations
+    and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an elastic shell. Straight lines
+    are found in minutes: they have dense modes, one factor, and need neither ``norm``, ``sparsity`` nor samples to
+    learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at most 2 % above the least.
+    ``init`` writes ``auto``."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
     ``shell`` is the metric of the shell space, as in the paper. It gives small wrinkles much weight. ``mixed`` is

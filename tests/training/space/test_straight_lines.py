@@ -55,7 +55,7 @@ def test_lines_of_lengths_and_angles_bend_where_lines_of_vertices_cut_across(ell
     assert away[0] < 0.3 * away[1]
 
 
-@pytest.mark.parametrize("kind", ["vertices", "nric"])
+@pytest.mark.parametrize("kind", ["vertices", "nric", "differential"])
 def test_derivatives_are_difference_quotients(ellipsoid, family, kind):
     lines = StraightLines.of(kind, family, ellipsoid).first(2)
     code = np.array([0.4, -0.2])
