@@ -18,9 +18,9 @@ from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import ShapeNetwork, predict
 from shapespace.training.runs.network_settings import SumSettings
-from shapespace.training.space.differential_coordinates import (
+from shapespace.training.space.face_coordinates import (
     PER_FACE,
-    DifferentialCoordinates,
+    FaceCoordinates,
     symmetric_matrices,
 )
 from shapespace.training.space.straight_collection import StraightCollection
@@ -78,13 +78,13 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 class VerticesFromFaces(ArrayModule):
-    """Rotations and stretches of faces (n, F, 9) → vertices (n, V, 3), as `DifferentialCoordinates.shape`."""
+    """Rotations and stretches of faces (n, F, 9) → vertices (n, V, 3), as `FaceCoordinates.shape`."""
 
     sides: Tensor
     matrices: Tensor
     slots: Tensor
 
-    def __init__(self, coordinates: DifferentialCoordinates) -> None:
+    def __init__(self, coordinates: FaceCoordinates) -> None:
         super().__init__(torch.float32)
         plan = coordinates.integration.plan
         positions = Substructures.of(*plan.positions)

@@ -35,9 +35,9 @@ from shapespace.training.space.generalisation import (
 from shapespace.training.space.modes import ModeError, coefficients, left_of_held_out, mode_count, pga, worthwhile
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
-Kind = Literal["vertices", "nric", "exponential"]
+Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
-COST: tuple[Kind, ...] = ("vertices", "nric", "exponential")
+COST: tuple[Kind, ...] = ("vertices", "differential", "nric", "exponential")
 #: A cheaper map is chosen if its error is at most this multiple of the least error.
 AS_GOOD = 1.02
 #: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
@@ -77,9 +77,10 @@ def choose_geometry(
 ) -> GeometryChoice:
     """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
 
-    ``modes.geometry = "auto"`` compares three maps on shapes that are held out of the modes in inner folds: straight
-    lines of vertices, straight lines of lengths and angles, and exponentials. All have the same number of modes, the
-    smallest that one of them would have. The cheapest map is chosen whose error is at most 2 % above the least.
+    ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
+    lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same number
+    of modes, the smallest that one of them would have. The cheapest map is chosen whose error is at most 2 % above the
+    least. No map remembers training shapes here.
     Means come from all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
@@ -188,7 +189,8 @@ class _Comparison:
 
     def _lines(self) -> dict[StraightKind, StraightLines]:
         found: dict[StraightKind, StraightLines] = {}
-        for kind in ("vertices", "nric"):
+        kinds: tuple[StraightKind, ...] = ("vertices", "differential", "nric")
+        for kind in kinds:
             try:
                 lines = StraightLines.of(kind, self._shapes, self._reference)
                 lines.require_mean(self._reference)

@@ -8,7 +8,7 @@ These are the cheapest maps from codes to shapes. They need no exponential and n
 - "nric": x̄ is the mean of lengths and angles (NRIC), and the u_j are principal components in the weighted norm of
   reconstruction. Gauss–Newton finds the vertices. Limbs can bend, but an angle changes in proportion to the code.
 - "differential": the coordinates are rotations and stretches of faces, from the mean shape. One Poisson equation gives
-  the vertices, see `differential_coordinates`.
+  the vertices, see `face_coordinates`.
 
 Mirror images may be among the shapes.
 """
@@ -31,7 +31,7 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.workers import run
 from shapespace.training.space.codes import Codes, NearestCode, gathered, nearest_code
-from shapespace.training.space.differential_coordinates import DifferentialCoordinates
+from shapespace.training.space.face_coordinates import FaceCoordinates
 from shapespace.training.space.modes import NEGLIGIBLE, ModeError
 
 StraightKind = Literal["vertices", "nric", "differential"]
@@ -150,6 +150,11 @@ class StraightLines:
         """``‖u_j‖²`` (m,)."""
         return (self.modes**2) @ self.weights
 
+    @property
+    def sizes(self) -> FloatArray:
+        """Lengths (m,) of the modes."""
+        return np.sqrt(self.squares)
+
     @cached_property
     def fields(self) -> FloatArray:
         """Vertex fields (m, V, 3) of the modes at the reference."""
@@ -171,9 +176,9 @@ class StraightLines:
         return Reconstructor(self.reference, self.eta)
 
     @cached_property
-    def differential(self) -> DifferentialCoordinates:
+    def differential(self) -> FaceCoordinates:
         """Differential coordinates from the reference."""
-        return DifferentialCoordinates(self.reference)
+        return FaceCoordinates(self.reference)
 
     def offsets(self, shapes: FloatArray) -> FloatArray:
         """Return differences (n, q) between shapes (n, V, 3) in any position and the mean."""
@@ -199,6 +204,10 @@ class StraightLines:
     def project(self, shapes: FloatArray) -> FloatArray:
         """Project shapes (n, V, 3) orthogonally onto the modes; return codes (n, m)."""
         return (self.offsets(shapes) * self.weights) @ self.modes.T / self.squares
+
+    def codes_of(self, shapes: FloatArray) -> FloatArray:
+        """Return the codes (n, m) of shapes (n, V, 3): on lines of vertices, projections are the nearest."""
+        return self.project(shapes) if self.kind == "vertices" else self.nearest(shapes).codes
 
     def shape(self, code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
         """Return the shape (V, 3) of a code (m,), and the function that computes its derivative (m, V, 3).
@@ -228,14 +237,14 @@ def _nearest(lines: StraightLines, item: tuple[FloatArray, FloatArray]) -> Neare
     return nearest_code(lines.shape, *item)
 
 
-def _about_their_mean(shapes: FloatArray, reference: TriangleMesh) -> DifferentialCoordinates:
+def _about_their_mean(shapes: FloatArray, reference: TriangleMesh) -> FaceCoordinates:
     """Return differential coordinates from the base that is the shape of the mean of shapes (n, V, 3)."""
     base = reference
     for _ in range(ROUNDS):
-        coordinates = DifferentialCoordinates(base)
+        coordinates = FaceCoordinates(base)
         moved = coordinates.shape(coordinates(shapes).mean(axis=0))
         base = base.with_vertices(align(moved, reference.vertices))
-    return DifferentialCoordinates(base)
+    return FaceCoordinates(base)
 
 
 def _shape_of_mean(reference: TriangleMesh, eta: float, mean: FloatArray) -> FloatArray:

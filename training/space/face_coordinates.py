@@ -30,7 +30,7 @@ def symmetric_matrices() -> FloatArray:
     return matrices.reshape(len(FACTORS), 9)
 
 
-class DifferentialCoordinates:
+class FaceCoordinates:
     """Coordinates (9F,) of shapes with the faces of a base mesh.
 
     The affine map that takes a face of the base, with its unit normal, to the same face of a shape is ``R (I + S)``.
