@@ -42,7 +42,9 @@ COST: tuple[Kind, ...] = ("vertices", "differential", "nric", "exponential")
 AS_GOOD = 1.02
 #: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
 #: their error.
-FOLDED_BETTER = 1.05
+FOLDED_BETTER = 1.03
+#: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
+FEW = 20
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -78,10 +80,10 @@ def choose_geometry(
     """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
 
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
-    lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same number
-    of modes, the smallest that one of them would have. The cheapest map is chosen whose error is at most 2 % above the
-    least. No map remembers training shapes here.
-    Means come from all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
+    lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
+    number of modes, the smallest that one of them would have, and with few shapes also half as many. The cheapest
+    map is chosen whose error is at most 2 % above the least. No map remembers training shapes here. Means come from
+    all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
     """
@@ -146,15 +148,16 @@ class _Comparison:
         maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
         try:
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step)
-            counts = [mode_count(settings, *at, self._own)]
+            asked = [mode_count(settings, *at, self._own)]
             maps["exponential"] = partial(self._on_exponentials, *at)
         except (ModeError, NotPositiveDefiniteError):  # exponentials have no mean
             if not lines:  # the stages that need a mean report it
                 return GeometryChoice("exponential", self._steps)
-            counts = []
+            asked = []
         every = folds(int(self._own.max()) + 1)
         own = {kind: straight_count(settings, each, self._shapes, self._original_index) for kind, each in lines.items()}
-        count = max(1, min(*counts, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        count = max(1, min(*asked, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
         folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
@@ -162,9 +165,10 @@ class _Comparison:
             kept, held_out = np.flatnonzero(~np.isin(self._own, index)), held_out + len(index)
             for each in list(away):
                 with suppress(ModeError, NotPositiveDefiniteError):
-                    near, given = maps[each](kept, index, count), self._some[index]
-                    distances = vertex_distances(near, given, self._reference.diagonal).mean(axis=1)
-                    away[each] = np.concatenate([away[each], distances])
+                    given = self._some[index]
+                    near = [maps[each](kept, index, some) for some in counts]
+                    distances = [vertex_distances(x, given, self._reference.diagonal).mean(axis=1) for x in near]
+                    away[each] = np.concatenate([away[each], np.mean(distances, axis=0)])
                     continue
                 del away[each]
             errors = {each: float(distances.mean()) for each, distances in away.items()}

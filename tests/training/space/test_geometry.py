@@ -5,7 +5,7 @@ import pytest
 
 from shapespace.shell.energy import Material
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.geometry import certain, cheapest, choose_geometry
+from shapespace.training.space.geometry import COST, certain, cheapest, choose_geometry
 from shapespace.training.space.held_out import held_out
 from shapespace.training.space.modes import most_modes
 from tests.training.conftest import bent
@@ -44,18 +44,19 @@ def test_shapes_that_bend_are_no_straight_lines_of_vertices(ellipsoid):
 @pytest.mark.parametrize(
     ("errors", "folded", "chosen"),
     [
-        ((1.015, 1.0, 1.1), 0, "vertices"),
-        ((1.03, 1.015, 1.0), 0, "nric"),
-        ((1.03, 1.03, 1.0), 0, "exponential"),
-        ((1.0, 1.05, 1.02), 0.5, "exponential"),
-        ((0.9, 1.0, 1.0), 0.5, "vertices"),
-        ((1.0, None, None), 0.5, "vertices"),
-        ((None, None, 1.0), 0, "exponential"),
-        ((None, None, None), 0, "exponential"),
+        ((1.015, 1.0, 1.0, 1.1), 0, "vertices"),
+        ((1.03, 1.015, 1.03, 1.0), 0, "differential"),
+        ((1.03, 1.03, 1.015, 1.0), 0, "nric"),
+        ((1.03, 1.03, 1.03, 1.0), 0, "exponential"),
+        ((1.0, 1.05, 1.05, 1.02), 0.5, "exponential"),
+        ((0.9, 1.0, 1.0, 1.0), 0.5, "vertices"),
+        ((1.0, None, None, None), 0.5, "vertices"),
+        ((None, None, None, 1.0), 0, "exponential"),
+        ((None, None, None, None), 0, "exponential"),
     ],
 )
 def test_the_cheapest_map_is_chosen_that_is_as_good_as_the_others(errors, folded, chosen):
-    kinds = zip(("vertices", "nric", "exponential"), errors, strict=True)
+    kinds = zip(COST, errors, strict=True)
     assert cheapest({kind: error for kind, error in kinds if error is not None}, folded) == chosen
 
 
