@@ -117,8 +117,8 @@ class ModeSettings(SettingsTable):
     shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential`` does it with rotations
     and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an elastic shell. Straight lines
     are found in minutes: they have dense modes, one factor, and need neither ``norm``, ``sparsity`` nor samples to
-    learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at most 2 % above the least.
-    ``init`` writes ``auto``."""
+    learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at most 2 % above the least,
+    or 5 % above exponentials. ``init`` writes ``auto``."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
     ``shell`` is the metric of the shell space, as in the paper. It gives small wrinkles much weight. ``mixed`` is

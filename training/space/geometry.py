@@ -38,8 +38,9 @@ from shapespace.training.space.straight_lines import StraightKind, StraightLines
 Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
 COST: tuple[Kind, ...] = ("vertices", "differential", "nric", "exponential")
-#: A cheaper map is chosen if its error is at most this multiple of the least error.
-AS_GOOD = 1.02
+#: A cheaper map is chosen if its error is at most the first multiple of the least error, or the second multiple of the
+#: error of exponentials. These are compared without networks and with dense modes, so served models are less exact.
+AS_GOOD, AS_GOOD_AS_NETWORKS = 1.02, 1.05
 #: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
 #: their error.
 FOLDED_BETTER = 1.03
@@ -82,8 +83,9 @@ def choose_geometry(
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
     number of modes, the smallest that one of them would have, and with few shapes also half as many. The cheapest
-    map is chosen whose error is at most 2 % above the least. No map remembers training shapes here. Means come from
-    all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
+    map is chosen whose error is at most 2 % above the least, or 5 % above the error of exponentials. No map
+    remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
+    modes may cost at most 2 % more.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
     """
@@ -219,12 +221,24 @@ def cheapest(errors: dict[Kind, float], folded: float) -> Kind:
     """
     if not errors:
         return "exponential"
-    kinds = [kind for kind in COST if kind in errors]
-    others = [errors[kind] for kind in kinds if kind != "vertices"]
-    if "vertices" in errors and folded > FOLDED_SHARE and others and FOLDED_BETTER * errors["vertices"] > min(others):
-        kinds.remove("vertices")
-    least = min(errors[kind] for kind in kinds)
-    return next(kind for kind in kinds if errors[kind] <= AS_GOOD * least)
+    others = {kind: error for kind, error in errors.items() if kind != "vertices"}
+    if "vertices" in errors and others and folded > FOLDED_SHARE:
+        for kind in (_as_good(others), min(others, key=lambda each: others[each])):
+            if others[kind] <= FOLDED_BETTER * errors["vertices"]:
+                return kind
+    return _as_good(errors)
+
+
+def _as_good(errors: dict[Kind, float]) -> Kind:
+    def good(kind: Kind) -> bool:
+        return all(errors[kind] <= _margin(kind, other) * errors[other] for other in errors if other != kind)
+
+    return next(kind for kind in COST if kind in errors and good(kind))
+
+
+def _margin(one: Kind, other: Kind) -> float:
+    """Return the multiple of an error up to which the cheaper of two maps is as good."""
+    return AS_GOOD_AS_NETWORKS if "exponential" in (one, other) else AS_GOOD
 
 
 def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
@@ -232,7 +246,8 @@ def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
     for other, theirs in errors.items():
         if other != kind:
             cheaper = COST.index(kind) < COST.index(other)
-            gaps = AS_GOOD * theirs - errors[kind] if cheaper else theirs - AS_GOOD * errors[kind]
+            margin = _margin(kind, other)
+            gaps = margin * theirs - errors[kind] if cheaper else theirs - margin * errors[kind]
             if gaps.mean() < CERTAIN * gaps.std() / np.sqrt(len(gaps)):
                 return False
     return True
