@@ -38,9 +38,9 @@ class RememberingMap:
 
     def __init__(self, plain: ShapeMap, codes: FloatArray, shapes: FloatArray, units: FloatArray) -> None:
         """Remember shapes (n, V, 3), which have the codes (n, m). ``units`` (m,) are the lengths of the modes."""
-        there = [found and found[0] for found in map(plain, codes)]
-        known = [k for k, found in enumerate(there) if found is not None]
-        missed = np.stack([align(shapes[k], there[k]) - there[k] for k in known]).reshape(len(known), -1)
+        there = {k: found[0] for k, code in enumerate(codes) if (found := plain(code)) is not None}
+        known = list(there)
+        missed = np.stack([align(shapes[k], near) - near for k, near in there.items()]).reshape(len(known), -1)
         self._codes = codes[known]
         kept = np.argsort(-(missed**2).sum(axis=1), kind="stable")[: GAUSSIANS.examples]
         self._plain, self._units = plain, units
