@@ -32,6 +32,7 @@ class EncodeSettings:
     long: int = 10
     fewest: int = 3  # if at least this many shapes remain,
     different: float = 0.01  # and the code there differs by more than this
+    reach: float = 2.5  # a short search is repeated from a training shape at most this many times as far as its result
     known: int = 512  # maximum number of training shapes for restarts
     candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
     margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it,
@@ -275,15 +276,19 @@ class EncodeSearch:
         """Return the fit to vertices, or a fit from the nearest training shape, with the number of shapes that remain.
 
         Where faces have nearly collapsed, the fit to lengths and angles that the search began with may be far away. A
-        search from there is long.
+        search from there is long. A short search may miss the effect of a stored training shape, which is nearer.
         """
         left = SETTINGS.shapes + SETTINGS.inside - fit.iterations
-        short = 0 < fit.iterations < SETTINGS.long
-        if short or left < SETTINGS.fewest or fit.status is Status.DEADLINE or not len(known):
+        if left < SETTINGS.fewest or fit.status is Status.DEADLINE or not len(known):
             return fit
         box = self._box_with(0.0)
         start = np.clip(self._fixed.into(known[0]), box.lower, box.upper)
-        other = self._from(start, box)
+        if 0 < fit.iterations < SETTINGS.long:
+            if self.away(start) > SETTINGS.reach * self.away(fit.x):
+                return fit
+            other = replace(near, x=start)
+        else:
+            other = self._from(start, box)
         if np.abs(self._decoder.latents.shorter(other.x - near.x) / box.scale).max() < SETTINGS.different:
             return fit
         other = self._by_vertices(other, box, most=left)
