@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import pages, studies
+from benchmarks import pages, served, studies
 from benchmarks.pages import ROOT
 from benchmarks.paper import SYSTEMS
 from shapespace.coordinates.nric import WeightedNorm
@@ -76,7 +76,20 @@ def page() -> str:
             add_paper(runs[key]["evaluation"], json.loads(again.read_text()))
     exported = runs["figure"]["config"].export
     manifest = json.loads((ROOT / "models" / exported.name / str(exported.version) / "manifest.json").read_text())
-    return pages.render("bundled", models=MODELS, bumpless=without_bump(), manifest=manifest, **runs)
+    folds = [fold["unseen"] for fold in pages.read_figures(served.FIGURES / f"{exported.name}.json")]
+    torus = runs["torus"]["evaluation"]
+    seeds = [seed["r2"] for run in runs.values() for seed in run["evaluation"]["seeds"]]
+    return pages.render(
+        "bundled",
+        models=MODELS,
+        bumpless=without_bump(),
+        manifest=manifest,
+        served=[served.average(folds, model, ("mean",)) for model in (None, "components")],
+        other_angles=max(r2["angles"] for name, r2 in torus["fresh"]["r2"].items() if name != "composite"),
+        lowest=min(r2["composite"]["total"] for r2 in seeds),
+        measured=pages.measured_with(*(ROOT / "runs" / name / "evaluation.json" for name in names.values())),
+        **runs,
+    )
 
 
 if __name__ == "__main__":

@@ -243,9 +243,10 @@ def failures(*rows: Row) -> list[int]:
     return [int(count) for count in counts]
 
 
-def held(row: Row) -> str:
-    """Return a cell: the share of coordinates within their intervals, and the width of these."""
-    return f"{np.mean(row.held):.0%} ({np.median(row.widths):.3f})" if row.held else "–"
+def held(name: str, rows: list[Row]) -> str:
+    """Say which shares of the coordinates are within their intervals, over the models of one variant of scans."""
+    shares = sorted(float(np.mean(row.held)) for row in rows if row.held)
+    return f"{name} {100 * np.median(shares):.0f} % ({100 * shares[0]:.0f} to {100 * shares[-1]:.0f})"
 
 
 def kinds(
@@ -281,15 +282,21 @@ def write_page() -> None:
         for row in (Row(**each) for each in found):
             every.setdefault((name, row.kind), []).append(row)
     unseen = {name: rows for (name, kind), rows in every.items() if kind == "unseen"}
-    others = {f"{name}, {kind}": rows for (name, kind), rows in every.items() if kind != "unseen"}
+    drawn = {name: rows for (name, kind), rows in every.items() if kind == "drawn"}
     models = {name: [row for (other, _), rows in every.items() if other == name for row in rows] for name in files}
-    spent = [float(np.median(row.seconds)) for rows in models.values() for row in rows]
-    _, lost, noticed, _ = failures(*(row for rows in every.values() for row in rows))
+    tried, lost, noticed, _ = failures(*(row for rows in every.values() for row in rows))
     scans = "whole", "noisy", "one camera"
     counts = sorted({len(row.errors) for rows in every.values() for row in rows})
+    equal = max(abs(1 - np.median(row.errors) / np.median(row.components)) for row in unseen["hippocampus"])
 
-    def both(row: Row) -> str:
-        return f"{middle(row.errors)} / {middle(row.components)}"
+    def line(name: str, rows: list[Row]) -> list[str]:
+        many, wrong, told, _ = failures(*rows)
+        errors = [f"{middle(row.errors)} / {middle(row.components)}" for row in rows]
+        return [name, *errors, f"{wrong} of {many}" + (f" ({wrong - told})" if wrong > told else "")]
+
+    def listed(some: dict[str, list[Row]], kind: int) -> str:
+        found = {name: failures(*rows) for name, rows in some.items()}
+        return ", ".join(f"{name} {each[kind]} of {each[0]}" for name, each in found.items() if each[kind])
 
     page = pages.render(
         "fit",
@@ -300,22 +307,18 @@ def write_page() -> None:
         far=FAR,
         choosing=CHOOSING,
         tries=f"{counts[0]} to {counts[-1]} tries of each kind",
+        all=tried,
         lost=lost,
         noticed=noticed,
-        horses=failures(*every["horse", "unseen"]),
-        unseen=table(
-            ("", *scans, "`encode`"),
-            ([name, *map(both, rows), middle(rows[0].encoded)] for name, rows in unseen.items()),
+        equal=100 * equal,
+        table=table(("", *scans, "wrong"), (line(name, rows) for name, rows in unseen.items())),
+        drawn=[max(float(np.median(rows[k].errors)) for rows in drawn.values()) for k in range(3)],
+        drawn_wrong=listed(drawn, 1),
+        alarms=listed(models, 3),
+        held=", ".join(
+            held(scans[k], [rows[k] for name, rows in drawn.items() if name != "freaky-torus"]) for k in range(3)
         ),
-        drawn=table(("", *scans), ([name, *(middle(row.errors) for row in rows)] for name, rows in others.items())),
-        failures=table(
-            ("", "tries", "failed", "noticed", "false alarms"),
-            ([name, *map(str, failures(*rows))] for name, rows in models.items()),
-        ),
-        low=min(spent),
-        middle=np.median(spent),
-        high=max(spent),
-        intervals=table(("", *scans), ([name, *map(held, rows)] for name, rows in others.items())),
+        measured=pages.measured_with(*FIGURES.glob("*.json")),
     )
     pages.write("fit", page)
 

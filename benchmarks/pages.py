@@ -20,6 +20,12 @@ def read_figures(file: Path) -> Any:
     return found["rows"] if found.keys() == {MADE_BY, "rows"} else found
 
 
+def measured_with(*files: Path) -> str:
+    """Say in a sentence which versions of shapespace made some files of figures."""
+    versions = {json.loads(file.read_text(encoding="utf-8"))[MADE_BY]["version"] for file in files}
+    return f"Measured with version {' and '.join(sorted(versions))}."
+
+
 def write_figures(file: Path, found: dict[str, Any] | list[Any]) -> None:
     """Write a mapping or a list of rows to a file in ``runs``, with what made it."""
     file.parent.mkdir(exist_ok=True)

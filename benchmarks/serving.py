@@ -25,6 +25,7 @@ import numpy as np
 import onnxruntime
 from threadpoolctl import threadpool_limits
 
+import shapespace
 from benchmarks import pages, synthetic
 from benchmarks.bundles import bundles, draw, normal_matrix, superlu
 from benchmarks.http_requests import http
@@ -51,13 +52,11 @@ GLB = MESH_FORMATS["glb"].encode
 BANDED = 5000
 PAGE = """# Serving
 
-How long does the server take for a shape, where does the time go, and how does it grow? A shape of the figure takes
-about ten milliseconds of one core. [benchmarks/NOTES.md](../../benchmarks/NOTES.md#performance) says why it is as fast
-as it is.
+How long does the server take for a shape, where does the time go, and how does it grow?
 
 Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu-time) of one thread in milliseconds,
-medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day}; the
-models may have been trained again since.
+medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with
+version {version}. [benchmarks/NOTES.md](../../benchmarks/NOTES.md#performance) says why the server is as fast as it is.
 """
 #: Numbers of codes that a graph takes at once.
 BATCHES = (1, 8, 64)
@@ -128,6 +127,9 @@ def away(model: ShapeModel, codes: Codes) -> list[float]:
 
 def stages(folders: list[Path], count: int) -> None:
     """Print times by stage, for every bundle in some folders."""
+    medians: dict[str, dict[str, float]] = {}
+    late: dict[str, float] = {}
+    limits: list[float] = []
     own: list[list[str]] = []
     batches: list[list[str]] = []
     tails: list[list[str]] = []
@@ -140,10 +142,13 @@ def stages(folders: list[Path], count: int) -> None:
         median = {name: statistics.median(values[3:]) for name, values in times.items()}
         distances = away(model, codes)
         name = f"{model.manifest.name}, V = {model.manifest.vertices}"
+        medians[name] = median
         exact.append([name, *to_exact(model, codes)])
         steps = statistics.mean(times["iterations"][3:])
         p95, p99 = (ms(float(np.quantile(times["sum"][3:], q))) for q in (0.95, 0.99))
-        limit = ceiling(model, codes[:5])
+        late[name] = float(np.quantile(times["sum"][3:], 0.95)) / median["sum"]
+        if limit := ceiling(model, codes[:5]):
+            limits.append(limit / median["sum"])
         solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
         own.append([name, ms(median["network"]), solved, ms(median["encode"]), ms(median["sum"])])
         others = f"{ms(median['full'])} / {ms(median['draft'])}"
@@ -153,14 +158,15 @@ def stages(folders: list[Path], count: int) -> None:
             batches.append([name, *found])
         furthest = f"{statistics.median(distances):.1f}, {max(distances):.1f}"
         beside.append([name, ms(median["blend shapes"]), ms(limit) if limit else "–", shares, furthest])
+    sums, slowest = [each["sum"] for each in medians.values()], max(late, key=lambda name: late[name])
     print("\n## A shape as a file\n")
-    print("Reconstruction takes most of the time, and writing the file little.\n")
-    print(table(("code → GLB of the fine mesh", "networks", "reconstruction (steps)", "file", "sum"), own))
-    print("\nShapes have the [quality](../reference/http.md#quality) `auto`.")
-    print("Steps are of [Gauss–Newton](../reference/glossary.md#gaussnewton). V is the number of coarse vertices.")
-    print("\nSlow codes are rare except for the horse and the torus.\n")
+    print(f"A shape takes {ms(min(sums))} to {ms(max(sums))} ms, by model. Reconstruction takes most of the time.\n")
+    print(table(("model", "networks", "reconstruction (steps)", "file", "sum"), own))
+    print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. Steps are of")
+    print("[Gauss–Newton](../reference/glossary.md#gaussnewton), as a mean. V is the number of coarse vertices.")
+    print(f"\nOne code in twenty takes up to {late[slowest]:.1f} times as long as the median ({slowest}).\n")
     print(table(("", "p95 of the sum", "p99", "full / draft", "without MKL"), tails))
-    print("\nThe last column is a multiple of the sum, for a server without [MKL](../reference/glossary.md#blas-mkl).")
+    print("\nThe last column: time without [MKL](../reference/glossary.md#blas-mkl), divided by the sum.")
     print("\nShapes of quality `auto` are as close to the exact exponential as full shapes.\n")
     print(table(("mean distance, 1e-4 of the diagonal", "auto", "full", "draft"), exact))
     print("\nIn brackets are multiples of the distance of full shapes. A product by design has a formula instead of an")
@@ -169,13 +175,19 @@ def stages(folders: list[Path], count: int) -> None:
         print("\nThe graph `decoder.onnx` gives the vertices of drafts in batches.\n")
         print(table(("code → vertices, one graph", *(f"batch of {size}" for size in BATCHES), "draft / full"), batches))
         print("\nTimes are for one shape, without a file. All columns are from one run, in turn.")
-    print("\nA shape takes about a tenth of the time of an exact one, and about ten times the time of blend shapes.\n")
-    print(table(("", "blend shapes", "exact exponential", "auto / full / draft, in SuperLU", "away"), beside))
-    print("\n*Blend shapes* is a lower bound: it adds m displacement fields and writes the same file.")
-    print("[*SuperLU*](../reference/glossary.md#superlu) is the time of one factorisation of the model's own matrix.")
-    print("Targets are 0.35 for `auto` and 0.8 for `full` of the figure, 0.25 and 0.4 for the torus.")
-    print("*Away*: largest distance of full shapes from a solution with tolerance 1e-10, in millionths of the")
-    print("diagonal, as median and largest over the codes.")
+    least = [each["sum"] / each["blend shapes"] for each in medians.values()]
+    print(f"\nA shape takes {min(least):.0f} to {max(least):.0f} times as long as blend shapes.")
+    if limits:
+        print(f"An exact shape takes {min(limits):.0f} to {max(limits):.0f} times as long as a shape.")
+    print()
+    print(table(("", "blend shapes", "exact shape", "auto / full / draft, ÷ SuperLU", "from the solution"), beside))
+    print("\n- *Blend shapes* is a lower bound: it adds m displacement fields and writes the same file.")
+    print("- *Exact shape*: the [exponential](../reference/glossary.md#exponential) with the time steps of the model.")
+    print("- *÷ SuperLU*: in factorisations of the model's own matrix by [SuperLU](../reference/glossary.md#superlu).")
+    print(
+        "- *From the solution*: distance of the furthest vertex of a full shape from a solution with tolerance 1e-10,"
+    )
+    print("  in millionths of the diagonal: median and largest over the codes.")
 
 
 def to_exact(model: ShapeModel, codes: Codes) -> list[str]:
@@ -317,11 +329,13 @@ def growth(count: int) -> None:
                 ratio = f"{median['sum'] / median['SuperLU']:.2f}"
                 found.append([size, ms(median["network"]), solved, ms(median["sum"]), ratio])
             if kind == "V":
-                print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.\n")
-                print(table((kind, "networks", "reconstruction (steps)", "sum", "sum / SuperLU"), found))
+                print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.")
+                print("The number m of modes makes almost no difference.\n")
+                print(table((kind, "networks", "reconstruction (steps)", "sum", "sum ÷ SuperLU"), found))
+                print()
             power = np.polyfit(np.log(sizes), np.log(sums), 1)[0]
-            print(f"\nFrom {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
-    print(f"The shapes are synthetic capsules. This process had up to {largest:.0f} MB.")
+            print(f"From {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
+    print(f"The shapes are synthetic capsules. The process took at most {largest:.0f} MB, for the largest V.")
 
 
 def ms(seconds: float) -> str:
@@ -353,7 +367,8 @@ def main() -> None:
         return
     with redirect_stdout(io.StringIO()) as text:
         run(arguments)
-    page = PAGE.format(day=f"{datetime.now(UTC):%Y-%m-%d}", count=arguments.count)
+    day = f"{datetime.now(UTC):%Y-%m-%d}"
+    page = PAGE.format(day=day, count=arguments.count, version=shapespace.__version__)
     pages.write("serving", page + text.getvalue())
 
 

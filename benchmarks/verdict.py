@@ -171,6 +171,26 @@ def listed(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
+def beaten(some: list[CollectionErrors], rival: str) -> str:
+    """Say for which collections a simple model is better than ours; empty if for none."""
+    worse = [each for each in some if each.ratios[rival] < each.ratio]
+    ours = listed([f"{each.ratio:.2f}" for each in worse])
+    return f" For {listed([each.title for each in worse])} this is better than our model ({ours})." if worse else ""
+
+
+def cost_of_fewer_shapes(runs: Path) -> str:
+    """Say how little accuracy a run with fewer computed shapes loses, by the example of the dancer."""
+    fewer, every = (pages.read_figures(runs / "results" / f"{name}.json") for name in ("samba-few", "samba"))
+    (few, less), (all_of_them, most) = (
+        (run["drawn"]["joint"] + run["drawn"]["of factors"], run["evaluation"]["fresh"]["r2"]["composite"]["total"])
+        for run in (fewer, every)
+    )
+    return (
+        f"With {few} instead of {all_of_them} shapes, the dancer's networks have "
+        f"[R²](reference/glossary.md#r-squared) {less:.4f} instead of {most:.4f}."
+    )
+
+
 def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
     """Return the text of the page."""
     by_name = {each.name: each for each in found}
@@ -183,7 +203,9 @@ def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
         beside=[(name, [each for each in found if each.best == name]) for name in rivals],
         titles=lambda some: listed([each.title for each in some]),
         range=lambda some: f"{min(each.ratio for each in some):.2f} to {max(each.ratio for each in some):.2f}",
-        said_ratios=lambda some, name: listed([f"{each.title} ({each.ratios[name]:.2f})" for each in some]),
+        ratios_of=lambda some, name: listed([f"{each.ratios[name]:.2f}" for each in some]),
+        beaten=beaten,
+        cost=cost_of_fewer_shapes(runs),
         ratio_of=lambda name: f"{by_name[name].ratio:.2f}",
         fewer={"whole": by_name["samba"], "half": collection("samba" + HALF, runs)},
         images=WITH_IMAGES,

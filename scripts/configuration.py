@@ -17,10 +17,43 @@ TARGET = Path(__file__).parents[1] / "docs" / "reference" / "configuration.md"
 HEAD = """\
 # Configuration
 
-Every setting of a file for `shapespace run`, by its TOML table. `shapespace init` writes a file with the
-settings that most people change. A setting marked *required* has to be there. `run` refuses unknown settings.
+Every setting of a file for `shapespace run`. `shapespace init` writes such a file for your meshes. Most files need
+little more than this:
 
-The [glossary](glossary.md) explains words such as *mode*, *factor* and *NRIC*.
+```toml
+[collection]
+data = "scans"               # folder of meshes, relative to this file
+
+[modes]
+geometry = "auto"            # straight lines where they are enough
+
+[samples]
+count = 1500                 # fewer samples train faster
+
+[export]
+name = "hands"
+title = "Hands"
+description = "Hands in many poses."
+licence = "CC0-1.0"
+
+[export.names]               # new names of factors
+"upper right" = "thumb"
+```
+
+A setting marked *required* has to be there. The run refuses unknown settings. A dotted heading such as
+`networks.factors` is a table `[networks.factors]`. The [glossary](glossary.md) explains words such as *mode*, *factor*
+and *NRIC*.
+"""
+RESEARCH = """\
+## For research: kinds of networks
+
+The defaults were chosen on several collections. These settings make the variants on the
+[pages of measurements](../measurements/results.md), among them the paper's own networks.
+"""
+IGNORED = """\
+## Settings of version 0.2 that have no effect
+
+The run reads and ignores {}. `python -m benchmarks.studies` trains such variants now.
 """
 NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
 
@@ -77,12 +110,17 @@ def shown(default: BaseModel | None, name: str, field: FieldInfo) -> Any:
     return getattr(default, name) if default else field.get_default(call_default_factory=True, validated_data={})
 
 
+def _is_ignored(field: FieldInfo) -> bool:
+    return (field.description or "").startswith("Not used any more")
+
+
 class Page:
     """The reference page: each model once, with all tables that it describes."""
 
     def __init__(self) -> None:
         #: The tables of each model: path, kind (or empty), and default.
         self.places: dict[type[BaseModel], list[tuple[str, str, BaseModel | None]]] = {}
+        self._ignored: list[str] = []
         self._visit(Config, "", "", None)
 
     def _visit(self, model: type[BaseModel], path: str, kind: str, default: BaseModel | None) -> None:
@@ -116,31 +154,38 @@ class Page:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
     def _section(self, model: type[BaseModel]) -> Iterator[str]:
-        (_, _, default), *others = self.places[model]
-        yield f"## {self._anchor(model)}" if self._anchor(model) else "## The tables"
+        (path, kind, default), *others = self.places[model]
+        yield f"### {self._anchor(model)}"
         yield ""
         yield " ".join((model.__doc__ or "").split()).replace("``", "`")
         yield ""
-        for place, kind, other in others:
+        for place, its_kind, other in others:
             differing = [
                 f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
                 for name, field in model.model_fields.items()
                 if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
             ]
-            also = f"- also as `{place}`" + (f" ({kind})" if kind else "")
+            also = f"- also as `{place}`" + (f" ({its_kind})" if its_kind else "")
             yield also + (f", where the defaults are {', '.join(differing)}" if differing else "")
         if others:
             yield ""
-        yield "| setting | type | default | meaning |"
-        yield "|---|---|---|---|"
+        rows = []
         for name, field in model.model_fields.items():
-            yield self._row(name, field, default)
-        yield ""
+            if _is_ignored(field):
+                self._ignored.append(f"`{path}.{name}`")
+            elif not (kind and name == "kind"):
+                rows.append(self._row(name, field, default))
+        if rows:
+            yield from ("| setting | type | default | meaning |", "|---|---|---|---|", *rows, "")
 
     def text(self) -> str:
         """Return the text of the page."""
-        lines = [line for model in self.places for line in self._section(model)]
-        return "\n".join([HEAD, *lines]).rstrip() + "\n"
+        lines, research = [HEAD, "## Settings of a run", ""], [RESEARCH]
+        for model, ((path, _, _), *_others) in self.places.items():
+            part = research if path.startswith(("networks.", "monolithic")) else lines
+            part.extend(self._section(model) if path else ())
+        self._ignored += [f"`{name}`" for name, field in Config.model_fields.items() if _is_ignored(field)]
+        return "\n".join([*lines, *research, IGNORED.format(", ".join(self._ignored))]).rstrip() + "\n"
 
 
 if __name__ == "__main__":

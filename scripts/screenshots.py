@@ -1,6 +1,11 @@
-"""Write the screenshots of the page in docs/, of bundled models: ``python -m scripts.screenshots``."""
+"""Write the screenshots in docs/: of the page, and of what the first tutorial makes.
+
+``python -m scripts.screenshots`` shows bundled models. ``python -m scripts.screenshots FOLDER`` writes the pictures of
+docs/tutorial/first-model.md alone; somebody has followed this tutorial in FOLDER.
+"""
 
 import io
+import sys
 from pathlib import Path
 
 from PIL import Image
@@ -13,6 +18,8 @@ DOCS = Path("docs")
 POSE = "0.3,-0.2,0.5,0.1,-0.6,0.3,0.2,0.4,0,0.7,-0.3,0.2,0.5,0.6,-0.4,0.2,0.3,-0.2,0.6,0.3"
 OTHER = "-0.5,0.4,-0.3,0.2,0.6,-0.4,0.1,-0.5,0.3,-0.6,0.4,0.1,-0.4,-0.5,0.5,-0.3,0.2,0.4,-0.5,0.6"
 FIGURE = f"#model=figure&z={POSE}"
+#: Code of the model of the first tutorial.
+BENT = "0.6,-0.5,0.5,0.3,-0.5,0.6,0.4,0.5"
 TORUS = "#model=freaky-torus&z=1,2,0.4,1"
 
 
@@ -30,8 +37,22 @@ def save_small(page: Page, path: Path) -> None:
     Image.open(io.BytesIO(page.screenshot())).save(path, quality=82, method=6)
 
 
+def first_model(folder: Path) -> None:
+    """Take the screenshots of the first tutorial: the head of its report, and the page with its model."""
+    with server(folder / "models") as (client, *_), sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = browser.new_page(viewport={"width": 1100, "height": 690})
+        page.goto((folder / "runs" / "meshes" / "report.html").resolve().as_uri())
+        save_small(page, DOCS / "tutorial" / "report.webp")
+        page.goto(f"{client.base_url}#model=meshes&z={BENT}")
+        page.set_default_timeout(120_000)
+        drawn(page, ".end")
+        save_small(page, DOCS / "tutorial" / "page.webp")
+        browser.close()
+
+
 def main() -> None:
-    """Take the screenshots."""
+    """Take the screenshots of bundled models."""
     desktop, phone = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
     tutorial = {"width": 1100, "height": 690}
     with server(Path("models")) as (client, *_), sync_playwright() as playwright:
@@ -62,7 +83,6 @@ def main() -> None:
 
         page = open_page(FIGURE, viewport=tutorial)
         drawn(page, ".end")
-        save_small(page, DOCS / "tutorial" / "page.webp")
         answer = client.get("/v1/models/figure/mesh", params={"latent": ",".join(["0.2"] * 20), "format": "obj"})
         points = [line.split()[1:] for line in answer.text.splitlines() if line.startswith("v ")]
         cloud = "\n".join(f"{x} {float(y) + 5} {z}" for x, y, z in points).encode()
@@ -79,4 +99,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:]:
+        first_model(Path(sys.argv[1]))
+    else:
+        main()

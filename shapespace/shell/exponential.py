@@ -286,7 +286,8 @@ class _CentredStep:
 
     def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
         """Compute ``DF(X)`` (3V, 3V)."""
-        return sparse.csc_array(sum(step.derivative(shape) for step, shape in self._both(unknown)) / 2)
+        (forward, after), (backward, before) = self._both(unknown)
+        return sparse.csc_array((forward.derivative(after) + backward.derivative(before)) / 2)
 
 
 _Equation = _Step | _CentredStep

@@ -289,8 +289,8 @@ class Recipe(SettingsTable):
     combiner: CombinerSettings = CombinerSettings()
     """The network that joins the factors' shapes."""
     fine_tuning: FitSettings | None = None
-    """How all networks are trained once more, together, on the joint samples. The paper trains factors and combiner one
-    after the other, and so do we if you leave this out. Parts of a combiner that were found in closed form stay."""
+    """How all networks are trained once more, together, on the joint samples. By default the run trains factors and
+    combiner one after the other. Parts of a combiner that were found in closed form stay."""
 
 
 class NetworkSettings(Recipe):
@@ -300,8 +300,8 @@ class NetworkSettings(Recipe):
 
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Where networks are trained by gradient descent: on the processor, on an NVIDIA or AMD GPU (``cuda``), or on the
-    GPU of an Apple computer (``mps``). ``auto`` takes a GPU if PyTorch finds one. See
-    [how to train on a GPU](../how-to/gpu.md). A change of the device trains no network again."""
+    GPU of an Apple computer (``mps``). ``auto`` takes a GPU if PyTorch finds one. See [how to train on a
+    GPU](../how-to/gpu.md). If you change only the device, finished networks stay."""
     seed: int = 0
     """Seed of the networks' initial weights and of the order of the samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])
@@ -310,5 +310,4 @@ class NetworkSettings(Recipe):
     seeds: list[int] = Field([])
     """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
     paper: bool = False
-    """Whether the paper's own system is trained too, for comparison: its factor networks, convolutions on stars and
-    schedules. This takes hours on a processor."""
+    """Whether the run also trains the paper's own system, for comparison. This takes hours on a processor."""

@@ -51,20 +51,19 @@ class CollectionSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
-    """Name of a built-in generator, which makes the shapes itself. ``expressive`` is a body in 149 poses: 100 with
-    moving hands and face, 49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need the extra
-    ``people``."""
+    """Built-in generator that makes the shapes. ``expressive`` is a body in 149 poses: 100 with moving hands and face,
+    49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need ``pip install
+    'shapespace[train,people]'``. Give either ``generator`` or ``data``."""
     data: Path | None = None
     """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
     one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
     command's ``--data`` takes precedence."""
     file: str | None = None
-    """Name of the file to read from each folder in ``data``, for data with one folder per subject. It may be a path,
-    such as ``surf/pial.ply``, and have ``*`` and ``?`` in it, as in ``*_mesh.ply``. Shapes have the names of the
-    folders."""
+    """Name of the file to read from each folder in ``data``, if every subject has a folder. It may be a path, such as
+    ``surf/pial.ply``, and have ``*`` and ``?`` in it, as in ``*_mesh.ply``. Shapes have the names of the folders."""
     reference: str | None = None
-    """Name of the reference mesh: it is scaled to area 1, and served shapes have its position and orientation. By
-    default it is the most central mesh."""
+    """Name of the reference mesh, which gives served shapes their position and orientation. By default it is the most
+    central mesh."""
     parts: list[str] = []
     """Names of the parts to keep, for meshes of several parts. The model predicts the first part and attaches the
     others to it. By default it keeps all parts, and predicts the largest. Parts have the names of the file's objects,
@@ -91,17 +90,17 @@ class MaterialSettings(SettingsTable):
     lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
     """Lamé's λ of the membrane."""
     eta: float = Field(Material.eta, gt=0)
-    """Weight η of bending against stretching, about the squared thickness. Larger values make the shell stiffer. Its
-    triangles may then collapse on the way to distant shapes."""
+    """Weight η of bending against stretching, about the squared thickness of the shell, where the reference has area 1.
+    Triangles may collapse if it is large."""
 
 
 class ExponentialSettings(SettingsTable):
     """The discrete exponential, which makes a shape from a code in K time steps."""
 
     first_step: FirstStep = "centred"
-    """The first of the K steps. ``paper`` goes straight on, as in the paper, and its error falls only like 1/K.
-    ``centred`` adds the acceleration, for the price of one step more. Codes then mean other shapes. A run directory of
-    version 0.2 keeps ``paper``, unless the configuration says ``centred``."""
+    """The first of the K steps. ``centred`` adds the acceleration, for the price of one step more. With ``paper`` the
+    error falls only like 1/K. Codes mean other shapes with each. A run directory of version 0.2 keeps ``paper`` by
+    default."""
 
 
 class ModeSettings(SettingsTable):
@@ -110,28 +109,27 @@ class ModeSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of modes m, at most one less than the number of shapes. ``auto`` adds modes until one more would lower the
-    mean error of held-out shapes by less than half a percent of the mean distance of shapes from the mean shape."""
+    """Number of modes m, at most one less than the number of shapes. ``auto`` minimises the error of held-out shapes,
+    as a share of their distance from the mean shape, plus half a percent for each mode."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
-    """The map from codes to shapes. ``vertices`` moves every vertex along a straight line, so modes add up like blend
-    shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential`` does it with rotations
-    and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an elastic shell. Straight lines
-    are found in minutes: they have dense modes, one factor, and need neither ``norm``, ``sparsity`` nor samples to
-    learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at most 2 % above the least,
-    or 5 % above exponentials. ``init`` writes ``auto``."""
+    """The map from codes to shapes; ``init`` writes ``auto``. ``vertices`` moves every vertex along a straight line, so
+    modes add up like blend shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential``
+    does it with rotations and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an
+    elastic shell. Straight lines are found in minutes: they have dense modes, one factor, and need neither ``norm``,
+    ``sparsity`` nor samples to learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at
+    most 2 % above the least, or 5 % above exponentials."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
-    ``shell`` is the metric of the shell space, as in the paper. It gives small wrinkles much weight. ``mixed`` is
-    ``vertices`` plus a tenth of ``shell``."""
+    ``shell`` is the metric of the shell space, which gives small wrinkles much weight. ``mixed`` is ``vertices`` plus a
+    tenth of ``shell``."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
-    """Weight λ of the sparsity term, as a share of the weight at which every principal mode would vanish. Larger
-    values make each mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of
-    some candidates that increases the error of held-out shapes by at most 2 %, and 0 if none does."""
+    """Weight λ of the sparsity term, as a share of the weight at which every mode would vanish. Larger values make each
+    mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of some candidates that
+    increases the error of held-out shapes by at most 2 %, and 0 if none does."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number K of time steps of the discrete logarithms. With one step, a mode moves every vertex along a straight
-    line, and modes add up like blend shapes. With many steps, modes bend the surface. ``auto`` takes 8, or 16 with the
-    paper's first step. It takes one if that does not raise the error of held-out shapes and at most a tenth of random
-    shapes fold."""
+    """Number K of time steps of the discrete logarithms. With one step, modes move vertices along straight lines and
+    add up like blend shapes. With many, modes bend the surface. ``auto`` takes 8 (16 with the paper's first step), or 1
+    if that does not raise the error of held-out shapes and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations of the sparse analysis, each over all modes."""
 
@@ -142,7 +140,7 @@ class FactorSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"modes"})
 
     count: int | None = Field(None, ge=1)
-    """Number of factors J; by default it follows from how much the modes overlap."""
+    """Number of factors J. By default it follows from the overlap of the modes."""
     modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
     """The factors, if you choose them yourself: the modes of each factor, such as ``[[0, 3], [1], [2, 4]]``. Modes are
     counted from 0, the strongest first. Every mode has to be in exactly one factor. Set ``modes.count`` too, so that
@@ -166,31 +164,30 @@ class SampleSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"distribution"})
 
     distribution: Distribution = "box"
-    """How random codes are drawn. ``box``, as in the paper's experiments, is uniform within the bounds. ``ball`` is
-    uniform, in each factor, in the ellipsoid that touches the bounds. Corners of the box, where shapes fold most, then
-    have no samples. ``normal`` takes normal distributions. Their standard deviation is half of the distance from the
-    middle to the bounds, and they end at the bounds. Coordinates with a period are always uniform. Fresh codes, on
-    which the model is measured once more, are always drawn from the box."""
+    """How random codes are drawn. ``box`` is uniform within the bounds. ``ball`` is uniform, in each factor, in the
+    ellipsoid that touches the bounds, so it leaves out the corners, where shapes fold most. ``normal`` is normal,
+    truncated at the bounds, with half of the distance from the middle to the bounds as standard deviation. Periodic
+    coordinates are always uniform."""
     count: int = Field(4000, ge=10)
-    """Number of joint samples: shapes of random codes. Computing them takes most of a run's time."""
+    """Number of joint samples: shapes of random codes. They take most of a run's time. 500 are enough for a first
+    look."""
     steps: int | None = Field(None, ge=1)
-    """Number K of time steps of the discrete exponentials. By default it is ``modes.log_steps``. Where that is ``auto``
-    and the first step is centred, it is the smallest of 8, 12, 16, 24 and 32 with an error 1 − R² of at most 1e-5
-    against many steps: a tenth of the error of good networks."""
+    """Number K of time steps of the discrete exponentials. By default it is ``modes.log_steps``. If that is ``auto``
+    and the first step is centred, it is the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps is
+    at most 1e-5."""
     factor_counts: list[int] | int | None = None
-    """Number of samples of each factor alone: one number for all factors, or one for each. Their codes are the
-    factor's part of the joint codes, and of further codes beyond ``count``. By default 1000, but at most ``count``. The
-    paper takes ``count``."""
+    """Number of samples of each factor alone: one number for all factors, or one for each. Their codes are the factor's
+    part of the joint codes, and of further codes beyond ``count``. By default 1000, but at most ``count``."""
     shapes: bool = True
     """Whether the codes of the collection's own shapes are training samples too. Few random codes lie near these
     shapes. Their number is at most a quarter of ``count``, spread evenly over the shapes."""
     derivatives: int | None = Field(None, ge=0)
     """Number of joint samples with derivatives by the code, which the networks learn too. Such a sample takes as long
-    as about ten samples without. Beside a few hundred samples, it is worth more than ten others. By default 60, but at
-    most a tenth of ``count``."""
+    as about ten others. It helps more than ten others if there are only a few hundred. By default 60, but at most a
+    tenth of ``count``."""
     part_size: int = Field(50, ge=1)
-    """Number of samples per file, and of derivatives a tenth of it. A worker computes one file at a time, and loses it
-    if it dies."""
+    """Number of samples per file, and ten times the number of derivatives. A worker computes one file at a time, and
+    loses it if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
     """Share of the joint samples that are used for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
@@ -223,8 +220,8 @@ class EvaluationSettings(SettingsTable):
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in the norm of all figures."""
     baselines: bool = False
-    """Whether networks with one factor are trained too, for comparison: ``monolithic`` and ``monolithic_paper``. This
-    about doubles the time of the stage ``networks``."""
+    """Whether the run also trains networks with one factor, ``monolithic`` and ``monolithic_paper``, for comparison.
+    This about doubles the time of the stage ``networks``."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
     """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020, for comparison. It may take as long as
     all samples. 0 leaves it out. Needs ``baselines``."""

@@ -29,6 +29,7 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from shapespace.model.shape_model import load
 from shapespace.service.settings import PREFIX, Settings
+from shapespace.training.runs.config import parse
 from tests.long.__main__ import TESTS
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, starting
@@ -39,13 +40,14 @@ MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 
 #: Blocks that are not tested, by page and first line, and why.
 UNTRIED = {
-    ("docs/how-to/serve.md", "docker build -t shapespace . && docker run --rm --read-only -p 8000:8000 shapespace"): (
-        "needs a container engine; `make long image-test` builds and tries the same"
-    ),
-    ("docs/how-to/collections.md", "pip install 'shapespace[train,people]'"): (
+    (
+        "docs/how-to/serve.md",
+        "docker build -t shapespace . && docker run --rm --read-only -p 127.0.0.1:8000:8000 shapespace",
+    ): ("needs a container engine; `make long image-test` builds and tries the same"),
+    ("docs/how-to/collections.md", "pip install '.[people]'"): (
         "installs 500 MB and trains for more than an hour; `make long people` makes the same bodies"
     ),
-    ("docs/how-to/gpu.md", "pip install --force-reinstall --no-deps torch==2.13.0 --index-url INDEX"): (
+    ("docs/how-to/gpu.md", ".venv/bin/pip install --force-reinstall torch==2.13.0 --index-url INDEX"): (
         "needs a GPU and an index of PyTorch"
     ),
     ("docs/how-to/call.md", "using System;"): "needs .NET or Mono; the block above it sends the same request",
@@ -104,10 +106,14 @@ def try_command(line: str) -> None:
             assert isinstance(command, Subcommand)
             with suppress(click.exceptions.Exit):  # of --help
                 command.make_context(words[0], words[1:] or ["--help"])
+        case "source":
+            assert words == [".venv/bin/activate"]  # as the Makefile makes it
         case "npm":
             assert words == ["install", "onnxruntime-web"]  # try_javascript has its runtime
         case "python" if words[0] == "-m":
             assert importlib.util.find_spec(words[1]), words[1]
+        case "python" if words[0] == "-c":
+            compile(words[1], line, "exec")
         case "dask":
             dask = Path(sys.executable).with_name("dask")
             told = subprocess.run([dask, words[0], "--help"], capture_output=True, text=True, check=True).stdout
@@ -124,6 +130,11 @@ def try_shell(text: str, server: Server, folder: Path) -> None:
     else:
         for line in text.splitlines():
             try_command(line.partition("#")[0])
+
+
+def try_configuration(text: str, server: Server, folder: Path) -> None:
+    """The only TOML on the pages is a configuration of a run."""
+    assert parse(text, "the page").collection.data
 
 
 def try_python(text: str, server: Server, folder: Path) -> None:
@@ -186,11 +197,13 @@ def try_drawing(text: str, server: Server, folder: Path) -> None:
 
 TRIALS: dict[str, Callable[[str, Server, Path], None]] = {
     "sh": try_shell,
+    "toml": try_configuration,
     "python": try_python,
     "js": try_javascript,
     "json": try_log_line,
     "": try_map,
     "text": try_drawing,
+    "console": lambda text, server, folder: None,  # what a program prints
 }
 
 
@@ -208,6 +221,7 @@ def test_a_new_version_is_rolled_out_and_back_as_the_page_says(tmp_path: Path) -
         with httpx.Client(base_url=server.url, timeout=60) as client:
             for line in "".join(block.text for block in ROLLOUT).splitlines():
                 if "grep" in line and "requests" in line:
+                    eventually(lambda: 'version="4"} 0.05' in client.get("/metrics").text, seconds=60)
                     found = [client.get("/v1/models/figure/mesh", params={"latent": code}) for code in codes]
                     answered += [Counter(answer.headers["Model-Version"] for answer in found)]
 
@@ -224,9 +238,21 @@ def test_a_new_version_is_rolled_out_and_back_as_the_page_says(tmp_path: Path) -
     assert 1 <= answered[0]["4"] <= 19
 
 
-@pytest.mark.parametrize(
-    "block", [block for block in BLOCKS if block.place not in UNTRIED and block not in ROLLOUT], ids=str
-)
+def in_order(blocks: list[Block]) -> list[Block]:
+    """Join the calls of a page, and its Python: readers type one block after the other."""
+    joined: dict[object, Block] = {}
+    for block in blocks:
+        together = block.language == "python" or (block.language == "sh" and "curl " in block.text)
+        key = (block.page, block.language) if together else block
+        before = joined[key].text if key in joined else ""
+        joined[key] = Block(block.page, block.language, before + block.text)
+    return list(joined.values())
+
+
+TRIED = in_order([block for block in BLOCKS if block.place not in UNTRIED and block not in ROLLOUT])
+
+
+@pytest.mark.parametrize("block", TRIED, ids=str)
 def test_blocks_do_what_they_say(server: Server, tmp_path: Path, block: Block) -> None:
     assert block.language in TRIALS, "add a trial for its language, or list it in UNTRIED"
     TRIALS[block.language](block.text, server, tmp_path)
