@@ -221,7 +221,8 @@ def cheapest(errors: dict[Kind, float], folded: float) -> Kind:
     """
     if not errors:
         return "exponential"
-    others = {kind: error for kind, error in errors.items() if kind != "vertices"}
+    others = dict(errors)
+    others.pop("vertices", None)
     if "vertices" in errors and others and folded > FOLDED_SHARE:
         for kind in (_as_good(others), min(others, key=lambda each: others[each])):
             if others[kind] <= FOLDED_BETTER * errors["vertices"]:
