@@ -225,6 +225,10 @@ ARRAYS = {
     # If parts move rigidly: for each fine vertex the index of its part or -1, and rest positions of these vertices.
     "prolongation_rigid": ArrayType(("W",), np.int32),
     "prolongation_rest": ArrayType(("R", 3), np.float64),
+    # If the fine mesh has detail that depends on the whole coarse shape: see mesh.fine_detail.
+    "prolongation_detail_rest": ArrayType(("V", 3), np.float64),
+    "prolongation_detail_axes": ArrayType(("r", "V", 3), np.float32),
+    "prolongation_detail_fields": ArrayType(("r", "W", 3), np.float32),
     # Attributes of the finest mesh in the user's file, with P polygons and C corners: see mesh.attributes.
     "surface_starts": ArrayType(("P + 1",), np.int32),
     "surface_corners": ArrayType(("C",), np.int32),

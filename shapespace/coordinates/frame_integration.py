@@ -163,7 +163,11 @@ class FrameIntegration:
         sides[:, 1] -= second * (2 * b * sin_0 * cos_0)
         np.negative(sides[:, 1], out=sides[:, 0])
         sides[:, 0] -= sides[:, 2]
-        right = self._divergence @ sides.reshape(3, -1).T + self._anchored
+        return self.positions(sides.reshape(3, -1).T)
+
+    def positions(self, sides: FloatArray) -> FloatArray:
+        """Compute the vertices (V, 3) that fit vectors of the sides (3F, 3) best; side k of face f is row k F + f."""
+        right = self._divergence @ sides + self._anchored
         # One column at a time: Pardiso takes more than twice as long for three at once.
         return np.stack([self._poisson.solve(column) for column in right.T], axis=1)
 

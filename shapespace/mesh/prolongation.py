@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.closest_points import closest_barycentric
+from shapespace.mesh.fine_detail import FineDetail
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import (
     Connectivity,
@@ -80,6 +81,8 @@ class Prolongation:
 
     Each fine vertex has a few dozen weights. `fitted` learns them from shapes whose fine vertices are known.
 
+    `detailed` adds displacements that depend on the whole coarse shape.
+
     An attached part is bound to its anchors as a whole, so its map is affine. If it is rigid, its rest shape then
     replaces the mapped one, aligned to it.
     """
@@ -87,6 +90,7 @@ class Prolongation:
     faces: IntArray  # (F, 3) faces of the coarse mesh
     weights: sp.csr_array  # (Vf, 2V) B beside C
     rigid: tuple[RigidPart, ...] = ()  # parts that move rigidly
+    detail: FineDetail | None = None  # displacements that depend on the whole shape
 
     @classmethod
     def of(cls, coarse: TriangleMesh, fine: TriangleMesh, parts: Sequence[AttachedPart] = ()) -> Prolongation:
@@ -108,6 +112,8 @@ class Prolongation:
         if vertices.ndim > 2:
             return np.stack([self(shape) for shape in vertices]).reshape(*vertices.shape[:-2], -1, 3)
         fine: FloatArray = self.weights @ self._regressors(vertices)
+        if self.detail:
+            fine += self.detail(vertices)
         for part in self.rigid:
             fine[part.vertices] = align(part.rest, fine[part.vertices])
         return fine
@@ -146,6 +152,15 @@ class Prolongation:
                 change = np.linalg.solve(moments, np.einsum("nrki,nri->rk", x, misfit)[..., None])[..., 0]
                 data[places] += change - on_vertices * (share * change).sum(axis=1, keepdims=True)
         return replace(self, weights=sp.csr_array((data, weights.indices, weights.indptr), shape=weights.shape))
+
+    def detailed(
+        self, rest: FloatArray, coarse: FloatArray, fine: FloatArray, rows: IntArray, shapes: IntArray, ridge: float
+    ) -> Prolongation:
+        """Return a prolongation that also has the detail learned from some shapes; see `fitted` for the arguments."""
+        missing = np.zeros((len(shapes), *fine.shape[1:]))
+        for k, shape in enumerate(shapes):
+            missing[k, rows] = fine[shape][rows] - self(coarse[shape])[rows]
+        return replace(self, detail=FineDetail.fitted(rest, coarse[shapes], missing, ridge))
 
     @property
     def vertex_count(self) -> int:
@@ -194,6 +209,12 @@ class Prolongation:
             for k, (vertices, places) in enumerate(self.rigid):
                 part[vertices], rest[vertices] = k, places
             found |= {"rigid": part, "rest": rest[part >= 0]}
+        if self.detail:
+            found |= {
+                "detail_rest": self.detail.rest,
+                "detail_axes": self.detail.axes.astype(np.float32),
+                "detail_fields": self.detail.fields,
+            }
         return {PREFIX + name: array for name, array in found.items()}
 
     @classmethod
@@ -224,7 +245,8 @@ class Prolongation:
         if len(wrong):
             found = f"the weights of fine vertex {wrong[0]} sum up to {sums[wrong[0]]:.6g}, not 1"
             raise ProlongationError(f"{found}; it would not move with the shape")
-        return cls(connectivity.faces, matrix, _rigid_parts(arrays, len(indptr) - 1))
+        detail = _detail(arrays, connectivity.vertex_count, len(indptr) - 1)
+        return cls(connectivity.faces, matrix, _rigid_parts(arrays, len(indptr) - 1), detail)
 
 
 def submesh(mesh: TriangleMesh, vertices: IntArray) -> TriangleMesh:
@@ -283,6 +305,22 @@ def _rigid_parts(arrays: Mapping[str, NDArray], count: int) -> tuple[RigidPart, 
     order = np.argsort(part_of[there], kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(part_of[there][order])) + 1) if len(order) else []
     return tuple(RigidPart(there[part], rest[part]) for part in parts)
+
+
+def _detail(arrays: Mapping[str, NDArray], count: int, fine: int) -> FineDetail | None:
+    """Read the detail of a map from `count` vertices to `fine` vertices."""
+    names = ("detail_rest", "detail_axes", "detail_fields")
+    if not any(PREFIX + name in arrays for name in names):
+        return None
+    rest, axes, fields = (_flat(arrays, name, np.float64, 3 if name != names[0] else 2) for name in names)
+    if rest.shape != (count, 3) or axes.shape[1:] != (count, 3) or fields.shape != (len(axes), fine, 3):
+        raise ProlongationError(
+            f"{PREFIX}detail_rest must be ({count}, 3), {PREFIX}detail_axes (r, {count}, 3), and "
+            f"{PREFIX}detail_fields (r, {fine}, 3)"
+        )
+    if not all(np.isfinite(each).all() for each in (rest, axes, fields)):
+        raise ProlongationError(f"{PREFIX}detail_rest, _axes or _fields has an entry that is not finite")
+    return FineDetail(rest, axes, fields.astype(np.float32))
 
 
 def _flat(arrays: Mapping[str, NDArray], name: str, kind: type[np.number], dimensions: int) -> NDArray:

@@ -32,9 +32,11 @@ class EncodeSettings:
     long: int = 10
     fewest: int = 3  # if at least this many shapes remain,
     different: float = 0.01  # and the code there differs by more than this
+    reach: float = 2.5  # a short search is repeated from a training shape at most this many times as far as its result
     known: int = 512  # maximum number of training shapes for restarts
     candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
-    margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it
+    margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it,
+    few: float = 20  # or this number divided by the number of training shapes: few shapes say little about the range
     inside: int = 3  # additional shapes for finding a code inside the bounds that is as near
     as_near: float = 1.02  # a code inside the bounds is preferred if its distance is at most this many times as large
 
@@ -72,6 +74,12 @@ class EncodePreparation:
         self.root = np.sqrt(self.norm.squared)
         self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)  # z̄
 
+    @property
+    def margin(self) -> float:
+        """How far outside the bounds a code may lie, as a share of their width."""
+        codes = self.decoder.training_codes
+        return SETTINGS.margin if codes is None else max(SETTINGS.margin, SETTINGS.few / len(codes))
+
     @cached_property
     def grids(self) -> FactorGrids:
         """Grids of the periodic factors, from which starts are chosen."""
@@ -103,7 +111,7 @@ class EncodeSearch:
     ) -> None:
         self._prepared, self._decoder, self._root = prepared, prepared.decoder, prepared.root
         self._target, self._aim, self._fixed, self._bounds, self._deadline = target, aim, fixed, bounds, deadline
-        self._box = self._box_with(SETTINGS.margin if bounds is not Bounds.CLAMP else 0.0)
+        self._box = self._box_with(prepared.margin if bounds is not Bounds.CLAMP else 0.0)
 
     def __call__(self, objective: Objective) -> Fit:
         """Return the best fit by an objective."""
@@ -268,15 +276,19 @@ class EncodeSearch:
         """Return the fit to vertices, or a fit from the nearest training shape, with the number of shapes that remain.
 
         Where faces have nearly collapsed, the fit to lengths and angles that the search began with may be far away. A
-        search from there is long.
+        search from there is long. A short search may miss the effect of a stored training shape, which is nearer.
         """
         left = SETTINGS.shapes + SETTINGS.inside - fit.iterations
-        short = 0 < fit.iterations < SETTINGS.long
-        if short or left < SETTINGS.fewest or fit.status is Status.DEADLINE or not len(known):
+        if left < SETTINGS.fewest or fit.status is Status.DEADLINE or not len(known):
             return fit
         box = self._box_with(0.0)
         start = np.clip(self._fixed.into(known[0]), box.lower, box.upper)
-        other = self._from(start, box)
+        if 0 < fit.iterations < SETTINGS.long:
+            if self.away(start) > SETTINGS.reach * self.away(fit.x):
+                return fit
+            other = replace(near, x=start)
+        else:
+            other = self._from(start, box)
         if np.abs(self._decoder.latents.shorter(other.x - near.x) / box.scale).max() < SETTINGS.different:
             return fit
         other = self._by_vertices(other, box, most=left)

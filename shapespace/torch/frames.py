@@ -108,7 +108,7 @@ class FrameVertices(ArrayModule):
         by_side = [divergence[:, side * count + order] for side in range(3)]
         # The sides of a face sum up to zero, so two of them are enough.
         shorter = sparse.hstack([by_side[1] - by_side[0], by_side[2] - by_side[0]])
-        self._divergence = SparseProduct(_in_slots(shorter, positions.unknowns), dtype)
+        self._divergence = SparseProduct(in_slots(shorter, positions.unknowns), dtype)
         self._positions = LaplaceSolve(positions, dtype)
         self.slots, self.slot_count = positions.slots, len(positions.unknowns)
         self._means = None
@@ -125,7 +125,7 @@ class FrameVertices(ArrayModule):
             self.keep("left", place[left])
             self.keep("right", place[right])
             rotations = Substructures.of(*plan.rotations)
-            self._misfits = SparseProduct(_in_slots(plan.misfits, rotations.unknowns), dtype)
+            self._misfits = SparseProduct(in_slots(plan.misfits, rotations.unknowns), dtype)
             self._rotations = LaplaceSolve(rotations, dtype)
             self.keep("turn_slots", rotations.slots[order])
             self._turn_mean = ComponentMeans(rotations.components[order], dtype)
@@ -212,7 +212,7 @@ class ComponentMeans(ArrayModule):
         return x - self(x)
 
 
-def _in_slots(matrix: sparse.csr_array, unknowns: IntArray) -> sparse.csr_array:
+def in_slots(matrix: sparse.csr_array, unknowns: IntArray) -> sparse.csr_array:
     """Return the rows of a matrix in the order of slots; rows of empty slots are zero."""
     rows = matrix[np.maximum(unknowns, 0)]
     return rows.multiply((unknowns >= 0).astype(float)[:, None]).tocsr()

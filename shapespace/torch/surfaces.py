@@ -12,6 +12,7 @@ from torch import Tensor
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.nric import WeightedNorm, edge_lengths
+from shapespace.mesh.fine_detail import FineDetail
 from shapespace.mesh.prolongation import Prolongation, faces_at_vertices
 from shapespace.mesh.triangle_mesh import Connectivity, TriangleMesh
 from shapespace.torch.arrays import ArrayModule, SparseProduct, norm, tiny
@@ -92,11 +93,31 @@ class RigidPartAlignment(RigidAlignment):
         return self.target @ self.rotation(moments).transpose(1, 2) + centre
 
 
+class DetailDisplacements(RigidAlignment):
+    """Displacements (n, Vf, 3) of fine vertices for coarse vertices (n, V, 3); see `FineDetail`."""
+
+    axes: Tensor
+    fields: Tensor
+
+    def __init__(self, detail: FineDetail, dtype: torch.dtype) -> None:
+        super().__init__(detail.rest, dtype)
+        self.keep("axes", detail.axes.reshape(len(detail.axes), -1).T)
+        self.keep("fields", detail.fields.reshape(len(detail.fields), -1))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the displacements."""
+        x = points - points.mean(dim=1, keepdim=True)
+        rotation = self.rotation(x.transpose(1, 2) @ self.target)
+        coordinates = (x @ rotation - self.target).flatten(1) @ self.axes
+        return (coordinates @ self.fields).unflatten(1, (-1, 3)) @ rotation.transpose(1, 2)
+
+
 class FineVertices(ArrayModule):
     """Coarse vertices (n, slots, 3) → fine vertices (n, V, 3); see `Prolongation`."""
 
     corners: Tensor
     order: Tensor
+    slots: Tensor
 
     def __init__(self, prolong: Prolongation, slots: IntArray, slot_count: int, dtype: torch.dtype) -> None:
         super().__init__(dtype)
@@ -112,6 +133,10 @@ class FineVertices(ArrayModule):
         columns = np.concatenate([slots[on_vertices.col], slot_count + on_normals.col])
         matrix = sparse.csr_array((data, (rows, columns)), shape=(prolong.vertex_count, slot_count + count))
         self._weights = SparseProduct(matrix, dtype)
+        self._detail = None
+        if prolong.detail:
+            self.keep("slots", slots)
+            self._detail = DetailDisplacements(prolong.detail, dtype)
         self._parts = torch.nn.ModuleList(RigidPartAlignment(part.rest, dtype) for part in prolong.rigid)
         if prolong.rigid:
             moved = np.concatenate([part.vertices for part in prolong.rigid])
@@ -129,6 +154,8 @@ class FineVertices(ArrayModule):
         direction, area = summed[:, :, :3], summed[:, :, 3:]
         scaled = direction * (area.clamp_min(tiny(area)).sqrt() / norm(direction, 2))
         fine = self._weights(torch.cat([x, scaled], dim=1))
+        if self._detail is not None:
+            fine = fine + self._detail(x.index_select(1, self.slots))
         if not len(self._parts):
             return fine
         parts = [fine.index_select(1, self.get_buffer("rest"))]

@@ -9,12 +9,20 @@ from torch import Tensor, nn
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric, unwrap
 from shapespace.mesh.triangle_mesh import Connectivity
+from shapespace.solve.substructuring import Substructures
+from shapespace.torch.arrays import ArrayModule, SparseProduct
+from shapespace.torch.frames import LaplaceSolve, in_slots
 from shapespace.training.learning.combiners.combiner import CombinerNetwork
 from shapespace.training.learning.combiners.sums import SumCorrection
 from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.networks import ShapeNetwork, predict
 from shapespace.training.runs.network_settings import SumSettings
+from shapespace.training.space.face_coordinates import (
+    PER_FACE,
+    FaceCoordinates,
+    symmetric_matrices,
+)
 from shapespace.training.space.straight_collection import StraightCollection
 
 
@@ -69,26 +77,58 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=2)
 
 
-class StraightNetwork(ShapeNetwork):
-    """Codes (n, m) → NRIC (n, 2E): linear, or the lengths and angles of linear vertices."""
+class VerticesFromFaces(ArrayModule):
+    """Rotations and stretches of faces (n, F, 9) → vertices (n, V, 3), as `FaceCoordinates.shape`."""
 
-    def __init__(self, line: LinearNetwork, measure: LengthsAndAngles | None) -> None:
+    sides: Tensor
+    matrices: Tensor
+    slots: Tensor
+
+    def __init__(self, coordinates: FaceCoordinates) -> None:
+        super().__init__(torch.float32)
+        plan = coordinates.integration.plan
+        positions = Substructures.of(*plan.positions)
+        self._divergence = SparseProduct(in_slots(plan.divergence, positions.unknowns), torch.float32)
+        self._positions = LaplaceSolve(positions, torch.float32)
+        self.keep("slots", positions.slots)
+        self.keep("sides", np.moveaxis(coordinates.sides, 0, 2))  # (F, 3, 3), a side in each column
+        self.keep("matrices", symmetric_matrices())
+
+    def forward(self, faces: Tensor) -> Tensor:
+        turn, stretch = faces.split([3, PER_FACE - 3], dim=2)
+        sides = self.sides + (stretch @ self.matrices).unflatten(2, (3, 3)) @ self.sides
+        # The quaternion (w, v) of a rotation takes x to ``x + 2 w v × x + 2 v × (v × x)``.
+        half = ((turn * turn).sum(dim=2, keepdim=True) + 1e-12).sqrt() / 2
+        scalar, vector = torch.cos(half)[..., None], (torch.sin(half) / (2 * half) * turn)[..., None]
+        once = _cross(vector, sides)
+        turned = sides + 2 * (scalar * once + _cross(vector, once))
+        found: Tensor = self._positions(self._divergence(turned.permute(0, 3, 1, 2).flatten(1, 2)))
+        return found.index_select(1, self.slots)
+
+
+class StraightNetwork(ShapeNetwork):
+    """Codes (n, m) → NRIC (n, 2E): linear, or the lengths and angles of vertices from linear coordinates."""
+
+    def __init__(self, *steps: nn.Module) -> None:
         super().__init__()
-        self.line, self.measure = line, measure
+        self.steps = nn.Sequential(*steps)
 
     def forward(self, latent: Tensor) -> Tensor:
-        found: Tensor = self.line(latent)
-        return found if self.measure is None else self.measure(found)
+        found: Tensor = self.steps(latent)
+        return found
 
 
 def straight_composite(collection: StraightCollection) -> Composite:
     """Return the composite of a straight-line model: one factor, and a combiner that changes nothing."""
     lines, reference = collection.lines, collection.reference
+    measure = LengthsAndAngles(reference.connectivity)
     if lines.kind == "vertices":
-        line = LinearNetwork(reference.vertices, lines.modes)
-        network = StraightNetwork(line, LengthsAndAngles(reference.connectivity))
+        network = StraightNetwork(LinearNetwork(reference.vertices, lines.modes), measure)
+    elif lines.kind == "differential":
+        line = LinearNetwork(lines.mean.reshape(-1, PER_FACE), lines.modes)
+        network = StraightNetwork(line, VerticesFromFaces(lines.differential), measure)
     else:
-        network = StraightNetwork(LinearNetwork(lines.mean, lines.modes), None)
+        network = StraightNetwork(LinearNetwork(lines.mean, lines.modes))
     own = nric(reference.vertices, reference.connectivity)
     shapes = predict(network, torch.as_tensor(lines.coefficients, dtype=torch.float32)).numpy()
     scaling = Scaling.of(own, WeightedNorm.of(reference, eta=1.0).squared, unwrap(shapes, own))

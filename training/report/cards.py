@@ -33,6 +33,7 @@ SIMPLE = {
     "mirrored_components": "PCA with mirror images",
     "remembering_components": "PCA with memory of the training shapes",
     "linear_nric": "straight lines of lengths and angles",
+    "differential_coordinates": "straight lines of rotations and stretches",
 }
 #: Largest number of modes with pictures.
 MODES_SHOWN = 40

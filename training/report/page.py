@@ -134,6 +134,7 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
 GEOMETRIES = {
     "vertices": "straight lines of vertices",
     "nric": "straight lines of lengths and angles",
+    "differential": "straight lines of rotations and stretches",
     "exponential": "exponentials",
 }
 
@@ -153,7 +154,10 @@ def _geometry(choice: dict[str, Any]) -> str:
     )
     if not others:
         return f"{found}. The other maps had no mean shape."
-    return f"{found}, beside {' and '.join(others)}. A cheaper map is chosen if its error is at most 2 % larger."
+    return (
+        f"{found}, beside {' and '.join(others)}. A cheaper map is chosen if its error is at most 2 % larger, or 5 % "
+        "larger than the error of exponentials."
+    )
 
 
 def _correction(correction: dict[str, Any]) -> str:

@@ -244,7 +244,7 @@ class RunDirectory:
         """Read the time steps K of the logarithms, which were chosen with the mean."""
         return int(self.mean.read()["steps"])
 
-    def straight_kind(self) -> Literal["vertices", "nric"] | None:
+    def straight_kind(self) -> Literal["vertices", "nric", "differential"] | None:
         """Read the kind of straight lines from codes to shapes; None for exponentials."""
         kind = self.geometry.read_if_written().get("kind", "exponential")
         return None if kind == "exponential" else kind

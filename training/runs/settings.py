@@ -111,12 +111,13 @@ class ModeSettings(SettingsTable):
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, at most one less than the number of shapes. ``auto`` minimises the error of held-out shapes,
     as a share of their distance from the mean shape, plus half a percent for each mode."""
-    geometry: Literal["auto", "vertices", "nric", "exponential"] = "exponential"
+    geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
     """The map from codes to shapes; ``init`` writes ``auto``. ``vertices`` moves every vertex along a straight line, so
-    modes add up like blend shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``exponential``
-    bends the surface as an elastic shell. Straight lines are found in minutes: they have dense modes, one factor, and
-    need neither ``norm``, ``sparsity`` nor samples to learn from. ``auto`` takes the cheapest of the three whose error
-    on held-out shapes is at most 2 % above the least."""
+    modes add up like blend shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential``
+    does it with rotations and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an
+    elastic shell. Straight lines are found in minutes: they have dense modes, one factor, and need neither ``norm``,
+    ``sparsity`` nor samples to learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at
+    most 2 % above the least, or 5 % above exponentials."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
     ``shell`` is the metric of the shell space, which gives small wrinkles much weight. ``mixed`` is ``vertices`` plus a
@@ -124,7 +125,7 @@ class ModeSettings(SettingsTable):
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
     """Weight λ of the sparsity term, as a share of the weight at which every mode would vanish. Larger values make each
     mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of some candidates that
-    increases the squared error of held-out shapes by at most 3 %."""
+    increases the error of held-out shapes by at most 2 %, and 0 if none does."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number K of time steps of the discrete logarithms. With one step, modes move vertices along straight lines and
     add up like blend shapes. With many, modes bend the surface. ``auto`` takes 8 (16 with the paper's first step), or 1

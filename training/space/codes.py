@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -72,7 +72,12 @@ def nearest_codes(
 def gathered(results: Iterable[tuple[int, NearestCode]], count: int) -> Codes:
     """Return the codes of ``count`` searches that end in any order."""
     found = dict(progress(results, "finding the codes of your shapes", "shape", count))
-    codes, vertices, counts, status = zip(*(found[k] for k in range(count)), strict=True)
+    return together([found[k] for k in range(count)])
+
+
+def together(found: Sequence[NearestCode]) -> Codes:
+    """Return the codes of several searches."""
+    codes, vertices, counts, status = zip(*found, strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
 
 
@@ -155,13 +160,19 @@ def nearest_code(shape_of: ShapeMap, target: FloatArray, start: FloatArray) -> N
     return NearestCode(fit.x, align(shape_at(fit.x)[0], target), fit.iterations, fit.status)
 
 
-def _nearest(
-    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, item: tuple[FloatArray, FloatArray]
-) -> NearestCode:
-    def exponentials(code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
+def exponential_map(space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int) -> ShapeMap:
+    """Return the map from codes (m,) to exponentials along modes (m, V, 3) at the mean (V, 3)."""
+
+    def shape_of(code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
         path = exponential(space, mean, np.tensordot(code, modes, axes=1), steps)
         if not path.converged:
             return None
         return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)
 
-    return nearest_code(exponentials, *item)
+    return shape_of
+
+
+def _nearest(
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, item: tuple[FloatArray, FloatArray]
+) -> NearestCode:
+    return nearest_code(exponential_map(space, mean, modes, steps), *item)

@@ -35,14 +35,17 @@ from shapespace.training.space.generalisation import (
 from shapespace.training.space.modes import ModeError, coefficients, left_of_held_out, mode_count, pga, worthwhile
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
-Kind = Literal["vertices", "nric", "exponential"]
+Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
-COST: tuple[Kind, ...] = ("vertices", "nric", "exponential")
-#: A cheaper map is chosen if its error is at most this multiple of the least error.
-AS_GOOD = 1.02
+COST: tuple[Kind, ...] = ("vertices", "differential", "nric", "exponential")
+#: A cheaper map is chosen if its error is at most the first multiple of the least error, or the second multiple of the
+#: error of exponentials. These are compared without networks and with dense modes, so served models are less exact.
+AS_GOOD, AS_GOOD_AS_NETWORKS = 1.02, 1.05
 #: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
 #: their error.
-FOLDED_BETTER = 1.05
+FOLDED_BETTER = 1.03
+#: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
+FEW = 20
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -77,10 +80,12 @@ def choose_geometry(
 ) -> GeometryChoice:
     """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
 
-    ``modes.geometry = "auto"`` compares three maps on shapes that are held out of the modes in inner folds: straight
-    lines of vertices, straight lines of lengths and angles, and exponentials. All have the same number of modes, the
-    smallest that one of them would have. The cheapest map is chosen whose error is at most 2 % above the least.
-    Means come from all shapes, and modes of exponentials are dense, because sparse modes may cost at most 2 % more.
+    ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
+    lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
+    number of modes, the smallest that one of them would have, and with few shapes also half as many. The cheapest
+    map is chosen whose error is at most 2 % above the least, or 5 % above the error of exponentials. No map
+    remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
+    modes may cost at most 2 % more.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
     """
@@ -145,15 +150,16 @@ class _Comparison:
         maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
         try:
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step)
-            counts = [mode_count(settings, *at, self._own)]
+            asked = [mode_count(settings, *at, self._own)]
             maps["exponential"] = partial(self._on_exponentials, *at)
         except (ModeError, NotPositiveDefiniteError):  # exponentials have no mean
             if not lines:  # the stages that need a mean report it
                 return GeometryChoice("exponential", self._steps)
-            counts = []
+            asked = []
         every = folds(int(self._own.max()) + 1)
         own = {kind: straight_count(settings, each, self._shapes, self._original_index) for kind, each in lines.items()}
-        count = max(1, min(*counts, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        count = max(1, min(*asked, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
         folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
@@ -161,9 +167,10 @@ class _Comparison:
             kept, held_out = np.flatnonzero(~np.isin(self._own, index)), held_out + len(index)
             for each in list(away):
                 with suppress(ModeError, NotPositiveDefiniteError):
-                    near, given = maps[each](kept, index, count), self._some[index]
-                    distances = vertex_distances(near, given, self._reference.diagonal).mean(axis=1)
-                    away[each] = np.concatenate([away[each], distances])
+                    given = self._some[index]
+                    near = [maps[each](kept, index, some) for some in counts]
+                    distances = [vertex_distances(x, given, self._reference.diagonal).mean(axis=1) for x in near]
+                    away[each] = np.concatenate([away[each], np.mean(distances, axis=0)])
                     continue
                 del away[each]
             errors = {each: float(distances.mean()) for each, distances in away.items()}
@@ -188,7 +195,8 @@ class _Comparison:
 
     def _lines(self) -> dict[StraightKind, StraightLines]:
         found: dict[StraightKind, StraightLines] = {}
-        for kind in ("vertices", "nric"):
+        kinds: tuple[StraightKind, ...] = ("vertices", "differential", "nric")
+        for kind in kinds:
             try:
                 lines = StraightLines.of(kind, self._shapes, self._reference)
                 lines.require_mean(self._reference)
@@ -213,12 +221,25 @@ def cheapest(errors: dict[Kind, float], folded: float) -> Kind:
     """
     if not errors:
         return "exponential"
-    kinds = [kind for kind in COST if kind in errors]
-    others = [errors[kind] for kind in kinds if kind != "vertices"]
-    if "vertices" in errors and folded > FOLDED_SHARE and others and FOLDED_BETTER * errors["vertices"] > min(others):
-        kinds.remove("vertices")
-    least = min(errors[kind] for kind in kinds)
-    return next(kind for kind in kinds if errors[kind] <= AS_GOOD * least)
+    others = dict(errors)
+    others.pop("vertices", None)
+    if "vertices" in errors and others and folded > FOLDED_SHARE:
+        for kind in (_as_good(others), min(others, key=lambda each: others[each])):
+            if others[kind] <= FOLDED_BETTER * errors["vertices"]:
+                return kind
+    return _as_good(errors)
+
+
+def _as_good(errors: dict[Kind, float]) -> Kind:
+    def good(kind: Kind) -> bool:
+        return all(errors[kind] <= _margin(kind, other) * errors[other] for other in errors if other != kind)
+
+    return next(kind for kind in COST if kind in errors and good(kind))
+
+
+def _margin(one: Kind, other: Kind) -> float:
+    """Return the multiple of an error up to which the cheaper of two maps is as good."""
+    return AS_GOOD_AS_NETWORKS if "exponential" in (one, other) else AS_GOOD
 
 
 def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
@@ -226,7 +247,8 @@ def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
     for other, theirs in errors.items():
         if other != kind:
             cheaper = COST.index(kind) < COST.index(other)
-            gaps = AS_GOOD * theirs - errors[kind] if cheaper else theirs - AS_GOOD * errors[kind]
+            margin = _margin(kind, other)
+            gaps = margin * theirs - errors[kind] if cheaper else theirs - margin * errors[kind]
             if gaps.mean() < CERTAIN * gaps.std() / np.sqrt(len(gaps)):
                 return False
     return True

@@ -5,6 +5,7 @@ The simple models know the same shapes, have as many coordinates, and find codes
 - ``components``: principal components of the aligned vertices.
 - ``remembering_components``: principal components that remember the shapes they were found from, as our bundles do.
 - ``linear_nric``: principal components of lengths and angles, with vertices by Gauss–Newton.
+- ``differential_coordinates``: principal components of rotations and stretches of faces.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +26,14 @@ from shapespace.shell.space import FirstStep
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.codes import Codes, nearest_codes
+from shapespace.training.space.codes import Codes, ShapeMap, exponential_map, nearest_codes
 from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
 from shapespace.training.space.geometry import GeometryChoice, choose_geometry
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.memory import RememberingLines
+from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
 from shapespace.training.space.sparse_modes import find_modes
-from shapespace.training.space.straight_lines import StraightLines
+from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,8 @@ def held_out(
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
     number of the other shapes. The map from codes to shapes is as configured for the other shapes. ``steps`` is K, by
-    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. Straight lines of vertices
-    ``remember`` the shapes that they were found from, as bundles do. Raises ModeError if the other shapes have no mean,
-    or no modes.
+    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. The map may ``remember`` the
+    shapes that it was found from, as bundles do. Raises ModeError if the other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
@@ -114,13 +115,15 @@ def held_out(
     reached, stuck = [], []
     near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
     for each in [-(-count // 2), count] if counts is None else counts:
-        found = space.first(min(each, len(kept) - 1)).nearest(unseen)
+        some = space.first(min(each, len(kept) - 1))
+        found = some.nearest(unseen)
+        if remember:
+            found = RememberingMap(some.shape, some.codes_of(kept), kept, some.sizes).nearest(unseen, found)
         reached.append(found.codes.shape[1])
         stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
         for kind, nearest in rivals.items():
             near[kind].append(nearest(unseen, reached[-1]))
-        remembered = remember and choice.kind == "vertices"
-        near["modes"].append(near["remembering_components"][-1] if remembered else found.vertices)
+        near["modes"].append(found.vertices)
     return HeldOut(index, reached, near, np.full(len(index), choice.light_steps), stuck)
 
 
@@ -131,24 +134,39 @@ SimpleModel = Callable[[FloatArray, int], FloatArray]
 def simple_models(reference: TriangleMesh, kept: FloatArray, own: NDArray[np.bool_]) -> dict[str, SimpleModel]:
     """Return functions that approximate shapes (k, V, 3) with a number of coordinates, by the names of simple models.
 
-    Lines of lengths and angles are left out where their mean has no shape. ``own`` (n,) marks shapes (n, V, 3) that
-    are no mirror images.
+    Lines are left out where their mean has no shape. ``own`` (n,) marks shapes (n, V, 3) that are no mirror images.
     """
     rivals: dict[str, SimpleModel] = {"components": PrincipalComponents.of(kept[own], reference.vertices).nearest}
     if not own.all():
         rivals["mirrored_components"] = PrincipalComponents.of(kept, reference.vertices).nearest
     straight = StraightLines.of("vertices", kept, reference)
-    rivals["remembering_components"] = lambda some, m: RememberingLines(straight.first(m), kept).nearest(some)
-    with suppress(ModeError, NotPositiveDefiniteError):
-        lengths_and_angles = StraightLines.of("nric", kept, reference)
-        rivals["linear_nric"] = lambda some, m: lengths_and_angles.first(m).nearest(some).vertices
+
+    def remembering(unseen: FloatArray, count: int) -> FloatArray:
+        lines = straight.first(count)
+        memory = RememberingMap(lines.shape, lines.codes_of(kept), kept, lines.sizes)
+        return memory.nearest(unseen, lines.nearest(unseen)).vertices
+
+    rivals["remembering_components"] = remembering
+    names: tuple[tuple[str, StraightKind], ...] = (
+        ("linear_nric", "nric"),
+        ("differential_coordinates", "differential"),
+    )
+    for name, kind in names:
+        with suppress(ModeError, NotPositiveDefiniteError):
+            rivals[name] = partial(_nearest_on, StraightLines.of(kind, kept, reference))
     return rivals
+
+
+def _nearest_on(lines: StraightLines, unseen: FloatArray, count: int) -> FloatArray:
+    return lines.first(count).nearest(unseen).vertices
 
 
 class _Exponentials:
     """Exponentials at the mean of shapes (n, V, 3), which approximate unseen shapes (k, V, 3)."""
 
+    shape: ShapeMap
     _modes: FloatArray  # (m, V, 3)
+    _codes: FloatArray  # (n, m)
 
     def __init__(
         self,
@@ -175,10 +193,19 @@ class _Exponentials:
     def first(self, count: int) -> _Exponentials:
         """Return the exponentials along this number of modes."""
         found = copy(self)
-        found._modes = find_modes(
-            self._settings, self._space, self._mean, self._fields, count, self._original_index
-        ).vertices
+        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index)
+        found._modes, found._codes = modes.vertices, modes.coefficients
+        found.shape = exponential_map(self._space, self._mean, found._modes, self._steps)
         return found
+
+    def codes_of(self, _: FloatArray) -> FloatArray:
+        """Return codes (n, m) of the shapes that the modes were found from, to first order."""
+        return self._codes
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Lengths (m,) of the modes."""
+        return np.sqrt((self._modes**2).sum(axis=(1, 2)))
 
     def nearest(self, unseen: FloatArray) -> Codes:
         """Return the codes of the unseen shapes."""

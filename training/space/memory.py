@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from shapespace.arrays import FloatArray
-from shapespace.training.space.codes import NearestCode, nearest_code
-from shapespace.training.space.straight_lines import StraightLines
+from shapespace.mesh.rigid_motion import align
+from shapespace.training.space.codes import Codes, NearestCode, ShapeMap, nearest_code, together
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,21 @@ class ExampleGaussians:
 GAUSSIANS = ExampleGaussians()
 
 
-class RememberingLines:
-    """Straight lines of vertices that remember the shapes they were found from, with the Gaussians of a bundle.
+class RememberingMap:
+    """A map from codes to shapes that remembers some shapes, with the Gaussians of a bundle.
 
-    This is what our models do to networks, done to principal components. So a comparison with these is fair.
+    This is what our bundles do to lengths and angles, done to vertices. So all maps can be compared as they are served,
+    and with principal components that remember too.
     """
 
-    def __init__(self, lines: StraightLines, shapes: FloatArray) -> None:
-        """Remember shapes (n, V, 3)."""
-        offsets, self._codes = lines.offsets(shapes), lines.project(shapes)
-        missed = offsets - self._codes @ lines.modes
+    def __init__(self, plain: ShapeMap, codes: FloatArray, shapes: FloatArray, units: FloatArray) -> None:
+        """Remember shapes (n, V, 3), which have the codes (n, m). ``units`` (m,) are the lengths of the modes."""
+        there = {k: found[0] for k, code in enumerate(codes) if (found := plain(code)) is not None}
+        known = list(there)
+        missed = np.stack([align(shapes[k], near) - near for k, near in there.items()]).reshape(len(known), -1)
+        self._codes = codes[known]
         kept = np.argsort(-(missed**2).sum(axis=1), kind="stable")[: GAUSSIANS.examples]
-        self._lines, self._units = lines, np.sqrt(lines.squares)
+        self._plain, self._units = plain, units
         self._places = self._codes[kept] * self._units
         apart = cdist(self._places, self._places)
         widest = float(apart.max())
@@ -50,30 +53,33 @@ class RememberingLines:
         inverse = np.linalg.pinv(gaussians, rcond=GAUSSIANS.distinct / np.linalg.norm(gaussians, 2))
         self._weights = inverse @ missed[kept]
 
-    def shape(self, code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
+    def shape(self, code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
         """Return the shape (V, 3) of a code (m,), and the function that computes its derivative (m, V, 3)."""
+        found = self._plain(code)
+        if found is None:
+            return None
         away = code * self._units - self._places
         near = np.exp(-self._sharpness * (away**2).sum(axis=1))
-        lines = self._lines
+        vertices, plain = found
 
         def derivative() -> FloatArray:
             slopes = -2 * (self._sharpness * near)[:, None] * away * self._units
-            return (lines.modes + slopes.T @ self._weights).reshape(len(lines), -1, 3)
+            return plain() + (slopes.T @ self._weights).reshape(len(code), -1, 3)
 
-        return (lines.mean + code @ lines.modes + near @ self._weights).reshape(-1, 3), derivative
+        return vertices + (near @ self._weights).reshape(-1, 3), derivative
 
-    def nearest(self, shapes: FloatArray) -> FloatArray:
-        """Return the nearest shape (V, 3) to each shape (n, V, 3). The search starts twice: from the projection, and
-        from the nearest code of a remembered shape.
+    def nearest(self, shapes: FloatArray, plain: Codes) -> Codes:
+        """Return the codes of the nearest shapes to shapes (n, V, 3), from their codes in the plain map.
+
+        The search starts twice: from this code, and from the nearest code of a remembered shape.
         """
-        starts = self._lines.project(shapes)
-        return np.stack([self._nearest(shape, start) for shape, start in zip(shapes, starts, strict=True)])
+        return together([self._nearest(shape, start) for shape, start in zip(shapes, plain.codes, strict=True)])
 
-    def _nearest(self, shape: FloatArray, projected: FloatArray) -> FloatArray:
-        known = self._codes[((self._codes - projected) ** 2 @ self._units**2).argmin()]
-        found = [nearest_code(self.shape, shape, start) for start in (projected, known)]
+    def _nearest(self, shape: FloatArray, start: FloatArray) -> NearestCode:
+        known = self._codes[((self._codes - start) ** 2 @ self._units**2).argmin()]
+        found = [nearest_code(self.shape, shape, each) for each in (start, known)]
 
         def distance(each: NearestCode) -> float:
             return float(((each.vertices - shape) ** 2).sum())
 
-        return min(found, key=distance).vertices
+        return min(found, key=distance)

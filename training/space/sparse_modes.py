@@ -20,19 +20,20 @@ The iteration starts from the modes of the plain analysis, rotated to be as conc
 this start is a minimum. It leads to as low an objective as a start from localised pieces, in fewer iterations than a
 start from the modes without rotation.
 
-The right sparsity depends on the shapes. The modes cannot reproduce on held-out shapes what only one shape has, so a
-certain sparsity costs nothing. By default λ is the largest value that raises the square error of held-out shapes by at
-most 3 %. Principal modes in inner folds estimate this error. The search begins at the largest λ and starts each λ from
-the modes of the one before. At most λ a few rounds tell that the error is far too large. Only the last ones are solved
-to the end.
+The right sparsity depends on the shapes. By default λ is the largest value that raises the error of unseen shapes by at
+most 2 %, compared with principal modes in the norm of vertices. Inner folds measure this error: modes are found without
+some shapes, and the error is the mean distance of these shapes from the span of the modes. A short trial with the
+smallest λ comes first. If it costs too much, modes are dense and nothing else is tried. Otherwise the search begins at
+the largest λ, starts each λ from the modes of the one before, and does a few rounds. Only the chosen λ is solved to the
+end, with all shapes.
 
 What a sparsity costs in each norm is in benchmarks/NOTES.md.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
@@ -42,7 +43,16 @@ from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import analyse
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.modes import ModeProblem, Modes, Norm, localisation, pga, validation_norm
+from shapespace.training.space.modes import (
+    INNER_FOLDS,
+    NEGLIGIBLE,
+    ModeProblem,
+    Modes,
+    Norm,
+    localisation,
+    pga,
+    validation_norm,
+)
 
 #: ADMM iterations on modes before the next modes, and their over-relaxation, between 1 and 2.
 ADMM_ITERATIONS, OVERRELAXATION = 5, 1.6
@@ -55,13 +65,14 @@ VARIMAX_ROUNDS, SWEEPS = 200, 100
 #: modes have stopped changing.
 TOLERANCE: dict[Norm, float] = {"mixed": 5e-3, "vertices": 5e-3, "shell": 1e-3}
 PATIENCE = 10
-#: The same where a sparsity is only tried: the part, and the rounds. The rounds after these win back less than the last
-#: share of the objective.
-TRIAL_TOLERANCE, TRIAL_PATIENCE, TRIAL_GAIN = 2e-2, 5, 0.1
-#: The sparsity is the first of these whose modes raise the square error of held-out logarithms by at most this share of
-#: the error of principal modes.
+#: The same where a sparsity is only tried: the part, and the rounds.
+TRIAL_TOLERANCE, TRIAL_PATIENCE = 2e-2, 5
+#: The sparsity is the first of these whose modes raise the error of held-out logarithms by at most a share of the error
+#: of principal modes, or by a share of the logarithms' own length, which is negligible.
 SPARSITIES = (0.128, 0.064, 0.032, 0.016, 0.008, 0.004, 0.002, 0.001, 0.0005)
-ALLOWED_ERROR = 0.03
+ALLOWED_ERROR, NEGLIGIBLE_ERROR = 0.02, 1e-3
+#: Inner folds are added until at least this number of shapes is held out.
+HELD_OUT = 8
 
 
 def find_modes(
@@ -107,29 +118,21 @@ def spga(
     The meaning of ``sparsity`` does not depend on the number of shapes, on their size or on the mesh. The result is
     deterministic.
 
-    ``sparsity`` is λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At that
-    price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of `SPARSITIES` by
-    errors in vertices, or in the norm "shell" where that is the norm. Logarithms are (n, V, 3) at X̄ (V, 3), and η of
-    the space also weighs the angles in the 1-norm. For ``original_index`` see modes.mode_count, for ``tolerance`` see
-    `TOLERANCE`. Raises ModeError if the count is not possible, or the sparsity leaves no mode.
+    ``sparsity`` is λ as a share of ``max_j 2 |w_j|² ‖u_j‖² / ‖u_j‖_1`` over the modes of the plain analysis. At
+    that price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of
+    `SPARSITIES`, or plain modes where all cost too much, by errors in vertices, or in the norm "shell" where that
+    is the norm. Logarithms are (n, V, 3) at X̄ (V, 3), and η of the space also weighs the angles in the 1-norm. For
+    ``original_index`` see modes.mode_count, for ``tolerance`` see `TOLERANCE`. Raises ModeError if the count is not
+    possible, or the sparsity leaves no mode.
     """
     problem = _SparseProblem(space, mean, fields, count, norm)
-    D, W = problem.principal(count)
-    highest = problem.highest_price(D, W)
-    enough = _sparsity_criterion(space, mean, fields, D, norm, original_index) if sparsity is None else None
-    rotation = _varimax(problem.scaled(D))
-    D, W = _normalised(rotation.T @ D, rotation.T @ W)
-    shares = SPARSITIES if sparsity is None else [sparsity]
-    for share in progress(shares, "finding modes that move one part each", "sparsity", len(shares)):
-        price = share * highest
-        if enough and share != SPARSITIES[-1]:
-            tried = _alternate(problem, D, W, price, max_iterations, TRIAL_TOLERANCE, TRIAL_PATIENCE)[1]
-            if not enough(D, TRIAL_GAIN * tried[-1]["objective"]):
-                continue
-        converged, history = _alternate(problem, D, W, price, max_iterations, tolerance)
-        if enough and enough(D):
-            break
-    return replace(problem.modes(D, converged, history), sparsity=share)
+    if sparsity is None:
+        sparsity = _chosen_sparsity(space, mean, fields, count, norm, original_index, max_iterations)
+        if sparsity == 0:
+            return pga(space, mean, fields, count, validation_norm(norm))
+    D, W, highest = problem.start(count)
+    converged, history = _alternate(problem, D, W, sparsity * highest, max_iterations, tolerance)
+    return replace(problem.modes(D, converged, history), sparsity=sparsity)
 
 
 class _SparseProblem(ModeProblem):
@@ -154,6 +157,15 @@ class _SparseProblem(ModeProblem):
         """Return ``‖J d‖_1`` (m,) of fields (m, 3V)."""
         return self.weights @ np.abs(self.J @ D.T)
 
+    def start(self, count: int) -> tuple[FloatArray, FloatArray, float]:
+        """Return concentrated modes (m, 3V) with the span of the principal modes, their coefficients, and the price at
+        which the last principal mode vanishes.
+        """
+        D, W = self.principal(count)
+        highest = self.highest_price(D, W)
+        rotation = _varimax(self.scaled(D))
+        return *_normalised(rotation.T @ D, rotation.T @ W), highest
+
     def highest_price(self, D: FloatArray, W: FloatArray) -> float:
         """Return the largest λ at which one of these modes lowers the objective.
 
@@ -163,16 +175,67 @@ class _SparseProblem(ModeProblem):
         return float((2 * self.energies(D, W) / self.one_norms(D)).max())
 
 
-def _sparsity_criterion(
-    space: ShellSpace, mean: FloatArray, fields: FloatArray, D: FloatArray, norm: Norm, original_index: IntArray | None
-) -> Callable[..., bool]:
-    """Return a function that says whether modes (m, 3V) keep enough of the logarithms, compared with principal modes D,
-    see `SPARSITIES`. Its second argument is a share of the logarithms that they may lack.
-    """
-    problem = ModeProblem(space, mean, fields, 1, validation_norm(norm))
-    left = problem.left_of_held_out(original_index)[:, min(len(D), len(fields) - 1)].sum()
-    least = problem.project(D)[1] - ALLOWED_ERROR * float(left) / problem.total
-    return lambda modes, lacking=0.0: problem.project(modes)[1] >= least - lacking
+class _Trial:
+    """Modes without the shapes of one inner fold, and their error on these shapes."""
+
+    def __init__(
+        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, held: NDArray[np.bool_], count: int, norm: Norm
+    ) -> None:
+        kept = fields[~held]
+        self._judge = ModeProblem(space, mean, kept, 1, validation_norm(norm))
+        self._unseen = self._judge.balanced(fields[held])
+        self._problem = _SparseProblem(space, mean, kept, count, norm)
+        *self._start, self._highest = self._problem.start(count)
+        self._modes = [each.copy() for each in self._start]
+        self.lengths = self._norms(self._unseen)  # (k,) of the held-out logarithms
+        self.least = self._errors(self._judge.principal(count)[0])  # (k,) errors of principal modes
+
+    def _norms(self, rows: FloatArray) -> FloatArray:
+        return np.sqrt(np.einsum("kx,xk->k", rows, self._judge.M @ rows.T))
+
+    def _errors(self, modes: FloatArray) -> FloatArray:
+        """Return the distances (k,) of the held-out logarithms from the span of modes (m, 3V)."""
+        lowered = self._judge.M @ modes.T
+        W = np.linalg.lstsq(modes @ lowered, (self._unseen @ lowered).T, rcond=NEGLIGIBLE)[0]
+        return self._norms(self._unseen - W.T @ modes)
+
+    def errors(self, sparsity: float, max_iterations: int, *, again: bool) -> FloatArray:
+        """Return errors (k,) of modes with a sparsity. They start from the modes of the call before, or ``again``."""
+        D, W = [each.copy() for each in self._start] if again else self._modes
+        _alternate(self._problem, D, W, sparsity * self._highest, max_iterations, TRIAL_TOLERANCE, TRIAL_PATIENCE)
+        return self._errors(D)
+
+
+def _chosen_sparsity(
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    count: int,
+    norm: Norm,
+    original_index: IntArray | None,
+    max_iterations: int,
+) -> float:
+    """Return the largest sparsity that costs little on held-out shapes, see `SPARSITIES`; 0 if there is none."""
+    original_index = np.arange(len(fields)) if original_index is None else original_index
+    originals = int(original_index.max()) + 1
+    parts = min(INNER_FOLDS, originals)
+    folds = [original_index % parts == part for part in range(parts if parts > 1 else 0)]
+    enough = -(-HELD_OUT * parts // originals)
+    trials = [_Trial(space, mean, fields, held, min(count, int((~held).sum())), norm) for held in folds[:enough]]
+    if not trials:
+        return 0.0
+    least = float(np.concatenate([trial.least for trial in trials]).mean())
+    length = float(np.concatenate([trial.lengths for trial in trials]).mean())
+    most = least + max(ALLOWED_ERROR * least, NEGLIGIBLE_ERROR * length)
+
+    def cheap(sparsity: float, *, again: bool = False) -> bool:
+        found = [trial.errors(sparsity, max_iterations, again=again) for trial in trials]
+        return float(np.concatenate(found).mean()) <= most
+
+    if not cheap(SPARSITIES[-1], again=True):
+        return 0.0
+    shares = progress(SPARSITIES, "finding modes that move one part each", "sparsity", len(SPARSITIES))
+    return next((share for share in shares if cheap(share)), 0.0)
 
 
 class _Shrinkage:

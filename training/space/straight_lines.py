@@ -1,4 +1,5 @@
-"""Straight lines of shapes: ``x̄ + Σ_j w_j u_j`` in aligned vertices, or in lengths and angles.
+"""Straight lines of shapes: ``x̄ + Σ_j w_j u_j`` in aligned vertices, in lengths and angles, or in rotations and
+stretches.
 
 These are the cheapest maps from codes to shapes. They need no exponential and no samples:
 
@@ -6,6 +7,8 @@ These are the cheapest maps from codes to shapes. They need no exponential and n
   blend shapes do.
 - "nric": x̄ is the mean of lengths and angles (NRIC), and the u_j are principal components in the weighted norm of
   reconstruction. Gauss–Newton finds the vertices. Limbs can bend, but an angle changes in proportion to the code.
+- "differential": the coordinates are rotations and stretches of faces, from the mean shape. One Poisson equation gives
+  the vertices, see `face_coordinates`.
 
 Mirror images may be among the shapes.
 """
@@ -28,9 +31,10 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.workers import run
 from shapespace.training.space.codes import Codes, NearestCode, gathered, nearest_code
+from shapespace.training.space.face_coordinates import FaceCoordinates
 from shapespace.training.space.modes import NEGLIGIBLE, ModeError
 
-StraightKind = Literal["vertices", "nric"]
+StraightKind = Literal["vertices", "nric", "differential"]
 #: Tolerance of vertices from lengths and angles, as a share of the diagonal.
 TOLERANCE = 1e-6
 #: Most Gauss–Newton steps for a shape. Shapes near the training shapes take at most 30; a search that tries codes far
@@ -40,25 +44,27 @@ ITERATIONS = 60
 ROUNDING = 1e-9
 #: Smallest area of a face of the mean, as a share of its area in the reference: below it the mean has collapsed.
 LEAST_AREA = 1e-3
+#: Rounds of the mean of differential coordinates. The last moves no vertex by more than 1e-5 of the diagonal.
+ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class StraightLines:
-    """Straight lines through the mean of shapes, in vertices or in lengths and angles. Modes are sorted by strength.
+    """Straight lines through the mean of shapes, in coordinates of a kind. Modes are sorted by strength.
 
-    It is pickled without its solver. A process that unpickles it makes its own, at the first shape.
+    It is pickled without its solvers. A process that unpickles it makes its own, at the first shape.
     """
 
     kind: StraightKind
     reference: TriangleMesh  # the shape of the code 0, at the position of the collection's reference
-    mean: FloatArray  # (q,) x̄, flat vertices or NRIC
+    mean: FloatArray  # (q,) x̄, flat vertices, NRIC or differential coordinates
     modes: FloatArray  # (m, q) u_j, scaled so that the largest coefficient of a shape is 1
     weights: FloatArray  # (q,) weights of squares in the norm
     coefficients: FloatArray  # (n, m) orthogonal projections of the shapes
     eta: float = DEFAULT_ETA  # weight of the angles
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_reconstruct"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_reconstruct", "differential")}
 
     @classmethod
     def of(
@@ -80,6 +86,10 @@ class StraightLines:
             rows = shapes.reshape(len(shapes), -1)
             mean = rows.mean(axis=0)
             centre, weights = mean.reshape(-1, 3), np.ones(len(mean))
+        elif kind == "differential":
+            coordinates = _about_their_mean(shapes, reference)
+            centre, weights, rows = coordinates.base.vertices, coordinates.weights, coordinates(shapes)
+            mean = rows.mean(axis=0)
         else:
             rows = nric(shapes, reference.connectivity)
             angles = rows[:, rows.shape[1] // 2 :]
@@ -100,7 +110,8 @@ class StraightLines:
         some = offsets if kept is None else offsets[kept]
         u, s, axes = np.linalg.svd(some, full_matrices=False)
         number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
-        if s[0] <= ROUNDING * np.sqrt((mean**2) @ weights):
+        size = 1.0 if kind == "differential" else np.sqrt((mean**2) @ weights)
+        if s[0] <= ROUNDING * size:
             raise ModeError("there are no modes: all shapes are the same as the mean")
         coefficients = (u * s)[:, :number]
         peaks = coefficients[np.abs(coefficients).argmax(axis=0), np.arange(number)]
@@ -139,12 +150,17 @@ class StraightLines:
         """``‖u_j‖²`` (m,)."""
         return (self.modes**2) @ self.weights
 
+    @property
+    def sizes(self) -> FloatArray:
+        """Lengths (m,) of the modes."""
+        return np.sqrt(self.squares)
+
     @cached_property
     def fields(self) -> FloatArray:
         """Vertex fields (m, V, 3) of the modes at the reference."""
         if self.kind == "vertices":
             return self.modes.reshape(len(self), -1, 3)
-        return self._reconstruct.differential(self.reference.vertices, self.modes)
+        return self._change(self.reference.vertices, self.mean, self.modes)
 
     @cached_property
     def nric(self) -> FloatArray:
@@ -153,16 +169,23 @@ class StraightLines:
             return self.modes
         jacobian = NRICJacobian(self.reference.connectivity)
         matrix = jacobian.matrix(jacobian.gradients(self.reference.vertices))
-        return (matrix @ self.modes.T).T
+        return (matrix @ self.fields.reshape(len(self), -1).T).T
 
     @cached_property
     def _reconstruct(self) -> Reconstructor:
         return Reconstructor(self.reference, self.eta)
 
+    @cached_property
+    def differential(self) -> FaceCoordinates:
+        """Differential coordinates from the reference."""
+        return FaceCoordinates(self.reference)
+
     def offsets(self, shapes: FloatArray) -> FloatArray:
         """Return differences (n, q) between shapes (n, V, 3) in any position and the mean."""
         if self.kind == "vertices":
             return (align(shapes, self.reference.vertices) - self.reference.vertices).reshape(len(shapes), -1)
+        if self.kind == "differential":
+            return self.differential(shapes) - self.mean
         return unwrap(nric(shapes, self.reference.connectivity), self.mean) - self.mean
 
     def motions(self, shapes: FloatArray) -> FloatArray:
@@ -170,11 +193,21 @@ class StraightLines:
         offsets = self.offsets(shapes)
         if self.kind == "vertices":
             return offsets
-        return self._reconstruct.differential(self.reference.vertices, offsets).reshape(len(shapes), -1)
+        return self._change(self.reference.vertices, self.mean, offsets).reshape(len(shapes), -1)
+
+    def _change(self, vertices: FloatArray, at: FloatArray, directions: FloatArray) -> FloatArray:
+        """Return the derivatives (k, V, 3) of the shape (V, 3) of coordinates (q,) along directions (k, q)."""
+        if self.kind == "differential":
+            return self.differential.change(at, directions)
+        return self._reconstruct.differential(vertices, directions)
 
     def project(self, shapes: FloatArray) -> FloatArray:
         """Project shapes (n, V, 3) orthogonally onto the modes; return codes (n, m)."""
         return (self.offsets(shapes) * self.weights) @ self.modes.T / self.squares
+
+    def codes_of(self, shapes: FloatArray) -> FloatArray:
+        """Return the codes (n, m) of shapes (n, V, 3): on lines of vertices, projections are the nearest."""
+        return self.project(shapes) if self.kind == "vertices" else self.nearest(shapes).codes
 
     def shape(self, code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
         """Return the shape (V, 3) of a code (m,), and the function that computes its derivative (m, V, 3).
@@ -184,10 +217,13 @@ class StraightLines:
         values = self.mean + code @ self.modes
         if self.kind == "vertices":
             return values.reshape(-1, 3), lambda: self.fields
+        if self.kind == "differential":
+            vertices = self.differential.shape(values)
+            return vertices, lambda: self._change(vertices, values, self.modes)
         found = self._reconstruct.from_guess(values, tolerance=TOLERANCE, max_iterations=ITERATIONS)
         if not found.converged and code.any():
             return None
-        return found.vertices, lambda: self._reconstruct.differential(found.vertices, self.modes)
+        return found.vertices, lambda: self._change(found.vertices, values, self.modes)
 
     def nearest(self, shapes: FloatArray, workers: int = -1) -> Codes:
         """Find the codes whose shapes come closest to shapes (n, V, 3), in vertices after rigid alignment."""
@@ -199,6 +235,16 @@ class StraightLines:
 
 def _nearest(lines: StraightLines, item: tuple[FloatArray, FloatArray]) -> NearestCode:
     return nearest_code(lines.shape, *item)
+
+
+def _about_their_mean(shapes: FloatArray, reference: TriangleMesh) -> FaceCoordinates:
+    """Return differential coordinates from the base that is the shape of the mean of shapes (n, V, 3)."""
+    base = reference
+    for _ in range(ROUNDS):
+        coordinates = FaceCoordinates(base)
+        moved = coordinates.shape(coordinates(shapes).mean(axis=0))
+        base = base.with_vertices(align(moved, reference.vertices))
+    return FaceCoordinates(base)
 
 
 def _shape_of_mean(reference: TriangleMesh, eta: float, mean: FloatArray) -> FloatArray:

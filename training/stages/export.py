@@ -70,8 +70,8 @@ def _geometry(run: RunDirectory) -> Geometry:
     return Geometry(
         reference=mean,
         fine=fine,
-        # Lengths and angles are no tangent vectors.
-        modes=None if run.straight_kind() == "nric" else modes["vertices"],
+        # Lines of other coordinates than vertices have no tangent vectors.
+        modes=None if run.straight_kind() in ("nric", "differential") else modes["vertices"],
         training_codes=run.training_codes(),
         file_vertices=reference.get("file_vertices"),
         surface=_surface(run),

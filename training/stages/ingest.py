@@ -10,6 +10,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.attributes import surface_arrays, surface_entry
 from shapespace.mesh.attached_parts import attach_part
 from shapespace.mesh.coarsening import coarsen
+from shapespace.mesh.fine_detail import GAIN, RIDGES
 from shapespace.mesh.prolongation import AttachedPart, Prolongation, submesh
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
@@ -22,6 +23,8 @@ from shapespace.training.runs.settings import NEARLY_COARSE, CollectionSettings
 from shapespace.training.space.generalisation import FOLDS
 from shapespace.training.stages.stage import Run, Stage, StageWarning, read_meshes
 
+#: Most vertices of all fine shapes together for which fine detail is learned. It takes memory for several copies.
+MOST_DETAILED = 8_000_000
 #: Smallest angle of a good coarse mesh, in degrees.
 LEAST_ANGLE = 2
 #: What helps against a poor coarse mesh.
@@ -146,8 +149,9 @@ def _prolong(
 ) -> dict[str, Any]:
     """Write ``prolongation.npz``; return its errors between fine shapes (n, Vf, 3) and prolonged ones (n, V, 3).
 
-    The weights are fitted to all shapes if weights fitted without the shapes ``held`` come closer to these. The errors
-    are measured on the shapes ``held``. The reference is not among them, because the prolongation is exact there.
+    The weights are fitted to all shapes if weights fitted without the shapes ``held`` come closer to these. Detail that
+    depends on the whole shape is added in the same way. The errors are measured on the shapes ``held``. The reference
+    is not among them, because the prolongation is exact there.
     """
     own = np.unique(meshes.shell_faces)
     attached = []
@@ -160,8 +164,16 @@ def _prolong(
     learned, plain = (each.errors(coarse[held], (exact[k] for k in held)) for each in (fitted, prolong))
     if learned["mean"] < plain["mean"]:
         prolong, trial = prolong.fitted(coarse, exact, own, every), fitted
-    run.prolongation.write(**prolong.arrays())
     facts: dict[str, Any] = min(learned, plain, key=lambda errors: errors["mean"])
+    if exact.shape[0] * exact.shape[1] <= MOST_DETAILED:
+        known = np.setdiff1d(every, held)
+        tries = {ridge: trial.detailed(reference.vertices, coarse, exact, own, known, ridge) for ridge in RIDGES}
+        errors = {ridge: each.errors(coarse[held], (exact[k] for k in held)) for ridge, each in tries.items()}
+        ridge = min(errors, key=lambda each: errors[each]["mean"])
+        if errors[ridge]["mean"] <= (1 - GAIN) * facts["mean"]:
+            prolong = prolong.detailed(reference.vertices, coarse, exact, own, every, ridge)
+            trial, facts = tries[ridge], errors[ridge]
+    run.prolongation.write(**prolong.arrays())
     if attached:
         distances = trial.distances(coarse[held], (exact[k] for k in held))
         facts["parts"] = _part_errors(meshes, own, attached, distances)

@@ -73,6 +73,7 @@ def _straighten(run: Run) -> None:
         "nric": lines.nric,
         "vertices": lines.fields,
         "mean": lines.mean,
+        **({"differential": lines.modes} if lines.kind == "differential" else {}),
         "localisation": localisation(lines.nric, WeightedNorm.of(centre, run.config.material.eta)),
     }
     explained = float(every.explained[: len(lines)].sum())

@@ -93,7 +93,7 @@ class Run:
         grouped = dict(zip(factors["names"], factors["factors"], strict=True))
         scale, codes = float(self.directory.reference.read()["scale"]), self.directory.training_codes()
         if kind := self.directory.straight_kind():
-            field = modes["vertices"] if kind == "vertices" else modes["nric"]
+            field = modes["vertices" if kind == "vertices" else "nric" if kind == "nric" else "differential"]
             lines = StraightLines(
                 kind=kind,
                 reference=self.directory.mean_mesh(),

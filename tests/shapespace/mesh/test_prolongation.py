@@ -71,6 +71,45 @@ def test_fitted_weights_move_with_the_shape_and_keep_coarse_vertices(pair, shape
     np.testing.assert_array_equal(fitted.coarse_vertices, pair.index)
 
 
+@pytest.fixture(scope="module")
+def detailed(pair: Pair) -> tuple[Prolongation, np.ndarray]:
+    """A prolongation with detail, learned from all but the first of the shapes. Detail follows their length."""
+    x = pair.fine.vertices
+    rough = 0.02 * np.random.default_rng(1).standard_normal(x.shape)
+    rough[pair.index] = 0
+    lengths = np.array([1.25, 0.7, 0.9, 1.1, 1.2, 1.4])
+    shapes = np.stack([x * [length, 1, 1] + (length - 1) * rough for length in lengths])
+    every = np.arange(len(x))
+    coarse = shapes[:, pair.index]
+    return pair.prolong.detailed(pair.coarse.vertices, coarse, shapes, every, np.arange(1, 6), 1e-6), shapes
+
+
+def test_detail_that_follows_the_whole_shape_returns_on_an_unseen_shape(pair, detailed, move):
+    found, shapes = detailed
+    coarse = shapes[0, pair.index]
+    before, after = (np.linalg.norm(each(coarse) - shapes[0], axis=1).mean() for each in (pair.prolong, found))
+    assert after < 0.1 * before
+    np.testing.assert_allclose(found(pair.coarse.vertices), pair.fine.vertices, atol=1e-9)
+    np.testing.assert_allclose(found(coarse)[pair.index], coarse, atol=1e-9)
+    both = move(np.concatenate([coarse, found(coarse)]))
+    np.testing.assert_allclose(found(both[: len(coarse)]), both[len(coarse) :], atol=1e-6)
+    again = Prolongation.from_arrays(found.arrays())
+    np.testing.assert_allclose(again(coarse), found(coarse), atol=1e-6)
+
+
+def test_detail_of_another_form_is_refused(pair, detailed):
+    arrays = detailed[0].arrays()
+    names = [name for name in arrays if "detail" in name]
+    assert len(names) == 3
+    for name in names:
+        with pytest.raises(ProlongationError, match=f"there is no array {name}"):
+            Prolongation.from_arrays({key: array for key, array in arrays.items() if key != name})
+        with pytest.raises(ProlongationError, match=r"detail_rest must be \("):
+            Prolongation.from_arrays(arrays | {name: arrays[name][:-1]})
+        with pytest.raises(ProlongationError, match="not finite"):
+            Prolongation.from_arrays(arrays | {name: arrays[name] * np.nan})
+
+
 def test_fitting_to_what_a_prolongation_does_changes_nothing(pair, shape):
     shapes = np.stack([shape, bent(pair.fine.vertices, 0.7)])[:, pair.index]
     again = pair.prolong.fitted(shapes, pair.prolong(shapes), np.arange(pair.prolong.vertex_count), np.arange(2))

@@ -7,7 +7,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.training.space.generalisation import PrincipalComponents, vertex_distances
-from shapespace.training.space.memory import RememberingLines
+from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError
 from shapespace.training.space.straight_lines import StraightLines
 from tests.training.conftest import bent
@@ -55,7 +55,7 @@ def test_lines_of_lengths_and_angles_bend_where_lines_of_vertices_cut_across(ell
     assert away[0] < 0.3 * away[1]
 
 
-@pytest.mark.parametrize("kind", ["vertices", "nric"])
+@pytest.mark.parametrize("kind", ["vertices", "nric", "differential"])
 def test_derivatives_are_difference_quotients(ellipsoid, family, kind):
     lines = StraightLines.of(kind, family, ellipsoid).first(2)
     code = np.array([0.4, -0.2])
@@ -69,7 +69,8 @@ def test_derivatives_are_difference_quotients(ellipsoid, family, kind):
 
 def test_lines_that_remember_return_their_shapes_and_leave_others_alone(ellipsoid, family):
     lines = StraightLines.of("vertices", family, ellipsoid).first(1)
-    remembering, codes = RememberingLines(lines, family), lines.project(family)
+    codes = lines.codes_of(family)
+    remembering = RememberingMap(lines.shape, codes, family, lines.sizes)
     back = np.stack([remembering.shape(code)[0] for code in codes])
     assert vertex_distances(back, family, 1.0).max() < 1e-9
     plain = PrincipalComponents.of(family, ellipsoid.vertices).nearest(family, 1)
@@ -78,7 +79,8 @@ def test_lines_that_remember_return_their_shapes_and_leave_others_alone(ellipsoi
     assert remembering.shape(far)[0] == pytest.approx(lines.shape(far)[0], abs=1e-9)
     between = (codes[0] + codes[1]) / 2 + 0.1 * (codes[1] - codes[0])
     assert remembering.shape(between)[1]() == pytest.approx(slopes(remembering.shape, between), abs=1e-5)
-    assert vertex_distances(remembering.nearest(family[2:3]), family[2:3], 1.0).max() < 1e-3
+    found = remembering.nearest(family[2:3], lines.nearest(family[2:3]))
+    assert vertex_distances(found.vertices, family[2:3], 1.0).max() < 1e-3
 
 
 def test_equal_shapes_have_no_lines(ellipsoid):
