@@ -274,6 +274,19 @@ class Decoder:
                     z = self._combiner(others, until).astype(np.float64)
                 yield z[0]
 
+    def exchanged(self, code: FloatArray, j: int, parts: FloatArray) -> FloatArray:
+        """Return the predicted NRIC (n, 2E) of a code (m,) whose part of factor j is each of parts (n, m_j)."""
+        factors, _ = self._networks(code[None].astype(np.float32))
+        size = max(1, BATCH_EDGES // self.manifest.edges)
+        found = []
+        for k in range(0, len(parts), size):
+            with self._limited() as until:
+                own = self._factors[j](parts[k : k + size].astype(np.float32), until)
+                others = np.repeat(factors, len(own), axis=0)
+                others[:, j] = own
+                found.append(self._combiner(others, until).astype(np.float64))
+        return np.concatenate(found)
+
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
         """Return the NRIC (n, 2E) of factor j for its parts (n, m_j) of codes, normalised."""
         with self._limited() as until:

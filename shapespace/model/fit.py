@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
@@ -10,20 +10,20 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.coordinates.reconstruction import Reconstructor
-from shapespace.mesh.closest_points import MeshProximity, VertexFaces
+from shapespace.mesh.closest_points import MeshProximity
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice
-from shapespace.model.feature_search import FeatureSearch
 from shapespace.model.fit_constraints import FitConstraints
-from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted, VertexDerivatives
+from shapespace.model.fit_preparation import FitPreparation, StartShapes
+from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted
 from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, SearchAccuracy
-from shapespace.model.fit_settings import SETTINGS
+from shapespace.model.fit_settings import SETTINGS, Attempt
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import FitOptions
-from shapespace.model.placement import QUICK, THOROUGH, PlacementEffort, StartPlacement, evenly, start_placements
+from shapespace.model.part_exchange import SHORT, ShapeJudge
+from shapespace.model.placement import MORE, QUICK, THOROUGH, PlacementEffort, StartPlacement, start_placements
 from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
-from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.model.shape import Shape
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -42,13 +42,15 @@ class Fitter:
     The fit reduces a scan to a few thousand points and places random shapes on it in many rotations. From the best
     placements it alternates between closest points of both sides and Gauss–Newton steps of code, rotation, translation
     and scale together. The robust weights of distances (Geman and McClure) narrow as the fit improves. The first steps
-    use rough shapes and the factors' derivatives, the last steps solved shapes. Where parts of both sides remain
-    unmatched, a few steps pull these parts together.
+    use rough shapes and the factors' derivatives, the last steps solved shapes.
+
+    While the result is poor, the fit makes further attempts (SETTINGS.attempts). A few steps pull unmatched parts of
+    both sides together. Factors get the parts of other codes. Or the fit begins again with more rotations and with the
+    training shapes. A scan of a part may hide a limb, so there training shapes are compared with every result.
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        self.decoder = decoder
-        self._features: FeatureSearch | None = None
+        self._prepared = FitPreparation(decoder)
 
     def __call__(
         self,
@@ -72,69 +74,15 @@ class Fitter:
             LatentError: fixed coordinates that the model doesn't have, or with which numbers overflow.
             ModelFailedError: the networks failed.
         """
-        return _Fit(self, points, faces, options, deadline, progress or (lambda _: None))()
-
-    @cached_property
-    def reach(self) -> dict[MeshChoice, tuple[VertexFaces, IntArray]]:
-        """For each mesh, the faces around its vertices, and vertices that look for points."""
-        return {
-            choice: (VertexFaces(mesh.faces, len(mesh.vertices)), evenly(mesh.vertices, count))
-            for choice, count in (
-                (MeshChoice.COARSE, SETTINGS.coarse_vertices),
-                (MeshChoice.FINE, SETTINGS.fine_vertices),
-            )
-            for mesh in (self.decoder.mesh(choice),)
-        }
-
-    @cached_property
-    def shown(self) -> IntArray:
-        """Evenly spread coarse vertices, which represent a shape in the search for placements."""
-        return evenly(self.decoder.reference.vertices, SETTINGS.shape_points)
-
-    @cached_property
-    def starts(self) -> tuple[FloatArray, FloatArray]:
-        """Start codes (k, m) and their shapes (k, V, 3), coarse and aligned; made at the first scan."""
-        return self.shapes_of(self.codes({}))
-
-    @cached_property
-    def start_derivatives(self) -> dict[int, VertexDerivatives]:
-        """Derivatives at start codes, by their index, as earlier fits have computed them."""
-        return {}
-
-    def features(self, reconstruct: Reconstructor) -> FeatureSearch:
-        """Return the search for features that move around a shape; made at the first scan."""
-        if self._features is None:
-            self._features = FeatureSearch.of(self.decoder, reconstruct)
-        return self._features
-
-    def codes(self, fixed: Mapping[int, float]) -> FloatArray:
-        """Return the mean code and codes far apart from each other, (k, m), with some coordinates fixed."""
-        population = self.decoder.population
-        lower, upper = self.decoder.latents.box()
-        drawn = np.concatenate(
-            [population.mean[None], np.clip(population.sample(SETTINGS.random_shapes, 0), lower, upper)]
-        )
-        for k, value in fixed.items():
-            drawn[:, k] = value
-        return drawn[evenly(population.scores(drawn), SETTINGS.start_shapes)]
-
-    def shapes_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the codes (k, m) whose shapes are finite, with these shapes (k, V, 3)."""
-        with self.decoder.solver() as reconstruct:
-            rough = SearchedShapes(self.decoder, reconstruct, None, rough=True)
-            raw = np.stack([rough(code) for code in codes])
-        finite = np.isfinite(raw).all(axis=(1, 2))
-        if not finite.any():
-            raise InvalidScanError("No shape has the fixed coordinates. Send values nearer to the bounds.")
-        return codes[finite], self.decoder.placed(raw[finite], MeshChoice.COARSE)
+        return _Fit(self._prepared, points, faces, options, deadline, progress or (lambda _: None))()
 
 
 class _Fit:
-    """Fit to one scan; arguments as for Fitter."""
+    """Fit to one scan; other arguments as for Fitter."""
 
     def __init__(
         self,
-        fitter: Fitter,
+        prepared: FitPreparation,
         points: FloatArray,
         faces: IntArray,
         options: FitOptions,
@@ -142,25 +90,31 @@ class _Fit:
         progress: Callable[[float], None],
     ) -> None:
         self.progress, self.done = progress, 0.0
-        self.decoder, self.fitter, self.options, self.deadline = fitter.decoder, fitter, options, deadline
+        self.decoder, self.prepared, self.options, self.deadline = prepared.decoder, prepared, options, deadline
         self.searching = deadline and deadline.for_searching()
-        self.points, self.unit = points, fitter.decoder.manifest.scale
+        self.points, self.unit = points, self.decoder.manifest.scale
         self.scan = scan_of(np.asarray(points, np.float64) / self.unit, faces, np.random.default_rng(options.seed))
-        self.constraints = FitConstraints.of(options, fitter.decoder)
+        self.constraints = FitConstraints.of(options, self.decoder)
 
     def __call__(self) -> Fitted:
         fixed = self.options.fixed
-        self.codes, self.shapes = self.fitter.shapes_of(self.fitter.codes(fixed)) if fixed else self.fitter.starts
+        self.starts = self.prepared.shapes_of(self.prepared.codes(fixed)) if fixed else self.prepared.starts
+        self.remembered = None if fixed else self.prepared.remembered
+        self._reach(BEGUN)
         if not self.constraints.free:
             self._require_units()
-        self._reach(BEGUN)
         with self.decoder.solver() as reconstruct:
-            rough = self._search(reconstruct, self.scan, self.constraints, ROUGH)
-            self.features = self.fitter.features(reconstruct)
-            best, others = self._roughly(rough, QUICK, *([THOROUGH] if self.constraints.partial else []))
-            full = self._search(reconstruct, self.scan, self.constraints, SOLVED)
-            middle = self._search(reconstruct, self.scan, self.constraints, MIDDLE)
-            final, rival = self._fully(middle, full, best, others)
+            rough, middle, full = (
+                self._search(reconstruct, self.scan, self.constraints, accuracy) for accuracy in (ROUGH, MIDDLE, SOLVED)
+            )
+            self.features = self.prepared.features(reconstruct)
+            best, others = self._roughly(rough, QUICK)
+            self._reach(PLACED)
+            near = self._insistently(rough, middle, self._solved(middle, best))
+            if self.constraints.partial and not self._late:
+                near, others = self._with_memory(middle, near, others)
+            self._reach(NEARLY)
+            final, rival = self._against_rivals(full, full.run(near, SETTINGS.last_steps, first=False), best, others)
             self._reach(REFINED)
             self.ended = self._late
             ratio = None
@@ -170,11 +124,15 @@ class _Fit:
                 flip = np.array([-1, 1, 1])
                 scan = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)
                 constraints = replace(self.constraints, places=self.constraints.places * flip)
-                twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK, limit=best.cost)
+                twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK)
                 ratio = twin.cost / best.cost
+            counts = full.count + middle.count, rough.count
         # The solver is returned first: decoding the result needs a solver too.
-        counts = full.count + middle.count, rough.count
         return self._answer(full, final, posterior, explained, seen, ratio, rival, counts)
+
+    @property
+    def _late(self) -> bool:
+        return self.searching is not None and self.searching.passed
 
     def _reach(self, share: float) -> None:
         """Tell that a share of the work is done; further attempts at a poor fit do not lower it."""
@@ -182,12 +140,8 @@ class _Fit:
             self.done = share
             self.progress(share)
 
-    @property
-    def _late(self) -> bool:
-        return self.searching is not None and self.searching.passed
-
     def _require_units(self) -> None:
-        sizes = np.sqrt(self.shapes.var(axis=1).sum(axis=1))
+        sizes = np.sqrt(self.starts.shapes.var(axis=1).sum(axis=1))
         ratio = self.scan.size / float(np.median(sizes))
         if not 1 / (SETTINGS.units_of_part if self.options.partial else SETTINGS.units) <= ratio <= SETTINGS.units:
             raise InvalidScanError(
@@ -198,19 +152,19 @@ class _Fit:
     def _search(
         self, reconstruct: Reconstructor, scan: Scan, constraints: FitConstraints, accuracy: SearchAccuracy
     ) -> FitSearch:
-        vertex_faces, looking = self.fitter.reach[accuracy.mesh]
+        vertex_faces, looking = self.prepared.reach[accuracy.mesh]
         return FitSearch(self.decoder, reconstruct, scan, constraints, accuracy, vertex_faces, looking, self.searching)
 
-    def _placed(self, search: FitSearch, effort: PlacementEffort) -> list[StartPlacement]:
-        """Return the placements at which a search begins, the best first."""
+    def _placed(self, search: FitSearch, effort: PlacementEffort, shapes: FloatArray) -> list[StartPlacement]:
+        """Return the placements of shapes (k, V, 3) at which a search begins, the best first."""
         constraints = search.constraints
         if len(constraints.landmarks) < 3:
-            shown = self.shapes[:, self.fitter.shown]
+            shown = shapes[:, self.prepared.shown]
             return start_placements(
                 search.scan, shown, partial=constraints.partial, free=constraints.free, effort=effort
             )
         rows, starts = search.landmark_rows(), list[StartPlacement]()
-        for k, shape in enumerate(self.shapes):
+        for k, shape in enumerate(shapes):
             own = rows @ shape
             placement = Placement.between(own, constraints.places, scaled=constraints.free)
             if placement.scale > 0:
@@ -223,31 +177,12 @@ class _Fit:
         return sorted(starts, key=lambda start: start.score)[: effort.count]
 
     def _roughly(
-        self, search: FitSearch, *efforts: PlacementEffort, limit: float = np.inf
+        self, search: FitSearch, effort: PlacementEffort, more: StartShapes | None = None
     ) -> tuple[FitState, list[FitState]]:
-        """Return the best fit with rough shapes, and other fits.
-
-        The next effort follows only if all fits are poor. A best fit that costs more than ``limit`` gets no attempts.
-        """
-        states: list[FitState] = []
-        base: FitState | None = None
-        for effort in efforts:
-            states = sorted([*states, *self._followed(search, effort)], key=lambda state: state.cost)
-            states[0] = search.with_moved_feature(states[0], self.features, SETTINGS.attempt_steps)
-            for k in range(SETTINGS.attempts):
-                if self._late or states[0].cost > limit or not self._is_poor(*search.shares(states[0])):
-                    return states[0], states[1:]
-                # Continue twice from the best fit, then from the other fits.
-                before, base = base, states[0] if k < 2 or k - 1 >= len(states) else states[k - 1]
-                if base is not before:  # otherwise it would end in the same place
-                    again = search.run(base, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
-                    again = search.with_moved_feature(again, self.features, SETTINGS.attempt_steps)
-                    states[0] = min(states[0], again, key=lambda state: state.cost)
-        return states[0], states[1:]
-
-    def _followed(self, search: FitSearch, effort: PlacementEffort) -> list[FitState]:
-        """Return fits with rough shapes from the start placements, the best first."""
-        states = [self._start(search, start) for start in self._placed(search, effort)]
+        """Return the best fit with rough shapes, from the start shapes and ``more``; and other fits."""
+        both = [self.starts, *([more] if more else [])]
+        starts = StartShapes(*(np.concatenate(each) for each in zip(*both, strict=True)))
+        states = [self._start(search, starts, start) for start in self._placed(search, effort, starts.shapes)]
         done, most = 0, sum(max(2, round(part * len(states))) * steps for part, steps in SETTINGS.rounds)
         for part, steps in SETTINGS.rounds:
             some = states[: max(2, round(part * len(states)))]
@@ -258,13 +193,13 @@ class _Fit:
                 done += steps
                 self._reach(BEGUN + (PLACED - BEGUN) * done / most)
             states.sort(key=lambda state: state.cost)
-        return states
+        return search.with_moved_feature(states[0], self.features, SETTINGS.attempt_steps), states[1:]
 
-    def _start(self, search: FitSearch, start: StartPlacement) -> FitState:
+    def _start(self, search: FitSearch, starts: StartShapes, start: StartPlacement) -> FitState:
         """Return the state at a start placement, with derivatives that an earlier fit may have computed."""
         k = start.shape
-        state = FitState(self.codes[k], self.shapes[k], start.placement)
-        known = {} if self.options.fixed else self.fitter.start_derivatives
+        state = FitState(starts.codes[k], starts.shapes[k], start.placement)
+        known = {} if self.options.fixed or k >= len(self.starts.codes) else self.prepared.start_derivatives
         if k not in known:
             try:
                 known[k] = search.derivatives(state)
@@ -272,23 +207,77 @@ class _Fit:
                 return state
         return replace(state, derivatives=known[k])
 
-    def _fully(
-        self, middle: FitSearch, search: FitSearch, best: FitState, others: list[FitState]
+    def _solved(self, middle: FitSearch, state: FitState) -> FitState:
+        """Return a fit with solved shapes that begins at a fit with rough shapes."""
+        begun = middle.start(state.code, state.placement, state.shape)
+        if begun is None:
+            return state
+        found = middle.run(begun, SETTINGS.middle_steps, first=False)
+        if not self._late and self._is_poor(*middle.shares(found)):
+            found = middle.with_moved_feature(found, self.features, SETTINGS.again_steps)
+        return found
+
+    def _insistently(self, rough: FitSearch, middle: FitSearch, state: FitState) -> FitState:
+        """Return the best fit with solved shapes, after further attempts while it is poor."""
+        tried: dict[Attempt, FitState] = {}
+        for attempt in SETTINGS.attempts:
+            if self._late or not self._is_poor(*middle.shares(state)):
+                break
+            if tried.get(attempt) is state:  # it would end in the same place
+                continue
+            tried[attempt] = state
+            here = rough.start(state.code, state.placement, state.shape)
+            if here is None:
+                break
+            here = rough.run(here, 0, first=False)
+            found = self._attempted(rough, attempt, here)
+            if found is not None and found.cost < here.cost:
+                state = min(state, self._solved(middle, found), key=lambda each: each.cost)
+        return state
+
+    def _attempted(self, rough: FitSearch, attempt: Attempt, state: FitState) -> FitState | None:
+        """Return a fit with rough shapes that an attempt finds, beginning at a poor fit; None if it finds no other."""
+        if attempt is Attempt.RESTART:
+            return self._roughly(rough, THOROUGH if self.constraints.partial else MORE, self.remembered)[0]
+        if attempt is Attempt.PULL:
+            found = rough.run(state, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
+        else:
+            code = self.prepared.exchange(rough.reconstruct, self._judge, state)
+            begun = None if code is state.code else rough.start(code, state.placement, state.shape)
+            if begun is None:
+                return None
+            found = rough.run(begun, SETTINGS.attempt_steps, first=True)
+        return rough.with_moved_feature(found, self.features, SETTINGS.attempt_steps)
+
+    @cached_property
+    def _judge(self) -> ShapeJudge:
+        return ShapeJudge(self.decoder, self.scan, self.constraints)
+
+    def _with_memory(
+        self, middle: FitSearch, state: FitState, others: list[FitState]
+    ) -> tuple[FitState, list[FitState]]:
+        """Return the better of a fit and of one that begins at the likeliest training shape, and the other fits.
+
+        What a camera does not see may be explained by several shapes.
+        """
+        if self.remembered is None:
+            return state, others
+        codes, shapes = self.remembered
+        costs = [self._judge(state, *each, SHORT) for each in zip(codes, shapes, strict=True)]
+        k = int(np.argmin(costs))
+        if costs[k] > SETTINGS.behind * self._judge(state, state.code, state.shape, SHORT):
+            return state, others
+        begun = middle.start(codes[k], state.placement, state.shape)
+        if begun is None or self._apart(begun, state) < SETTINGS.alike:
+            return state, others
+        found = middle.run(begun, SETTINGS.middle_steps, first=False)
+        better, worse = (found, state) if found.cost < state.cost else (state, found)
+        return better, [worse, *others]
+
+    def _against_rivals(
+        self, search: FitSearch, final: FitState, best: FitState, others: list[FitState]
     ) -> tuple[FitState, FitState | None]:
         """Return the best fit with solved shapes, and another fit that is nearly as good, if there is one."""
-        begun = middle.start(best.code, best.placement, best.shape)
-        if begun is None:
-            return best, None
-        self._reach(PLACED)
-        nearly = middle.run(begun, SETTINGS.middle_steps, first=False)
-        self._reach(NEARLY)
-        final = search.run(nearly, SETTINGS.last_steps, first=False)
-        if not self._late and self._is_poor(*search.shares(final)):
-            again = middle.with_moved_feature(middle.run(final, 0, first=False), self.features, SETTINGS.again_steps)
-            if self._is_poor(*middle.shares(again)):
-                again = middle.run(again, SETTINGS.again_steps, first=False, drawn=SETTINGS.drawn_steps)
-            again = search.run(again, SETTINGS.last_steps, first=False)
-            final = again if again.cost < final.cost else final
         for other in others[: SETTINGS.rivals]:
             if (
                 self._late

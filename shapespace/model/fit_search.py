@@ -40,8 +40,6 @@ class SearchSettings:
     longest: float = 1.5  # longest step, in standard deviations of the population
     turn: float = 0.5  # largest rotation in a step, in radians
     shortest: float = 0.01  # a shorter step ends the search, in standard deviations of the population
-    # derivatives are used again until the code has moved this far, in standard deviations of the population
-    kept: float = 0.8
     tolerance: float = 1e-4  # solved shapes have converged if no vertex moves further
     landmark: float = 0.01  # default standard deviation of a landmark
     # points within this distance of the model count as explained; at most twice this distance with noise
@@ -66,11 +64,13 @@ class SearchAccuracy:
     still: float  # a movement of the shape by less than this length ends the search, as a fraction of the diagonal
     floor: float  # smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes
     independent: float  # share of the points that count as independent observations
+    # derivatives are used again until the code has moved this far, in standard deviations of the population
+    kept: float
 
 
-ROUGH = SearchAccuracy(MeshChoice.COARSE, True, 500, 2e-4, 5e-3, 0.1)
-MIDDLE = SearchAccuracy(MeshChoice.COARSE, False, 1000, 5e-4, 3e-4, 0.5)
-SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, 0.5)
+ROUGH = SearchAccuracy(MeshChoice.COARSE, True, 500, 2e-4, 5e-3, 0.1, 0.8)
+MIDDLE = SearchAccuracy(MeshChoice.COARSE, False, 1000, 5e-4, 3e-4, 0.5, 0.8)
+SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, 0.5, 2.0)
 
 
 class FitSearch:
@@ -98,7 +98,7 @@ class FitSearch:
         )
         self._diagonal = decoder.reference.diagonal
         self._whiten: FloatArray = np.asarray(np.linalg.inv(constraints.prior.root), np.float64)
-        self._reconstruct = reconstruct
+        self.reconstruct = reconstruct
         self._changes = derivatives if accuracy.mesh is MeshChoice.FINE else factor_derivatives
         self._shapes = SearchedShapes(decoder, reconstruct, deadline, SETTINGS.tolerance, rough=accuracy.rough)
         self.count = 0  # number of shapes computed so far
@@ -147,7 +147,7 @@ class FitSearch:
     def with_moved_feature(self, state: FitState, features: FeatureSearch, steps: int) -> FitState:
         """Move a feature to its most promising place in the scan and take steps, as long as this improves the fit."""
         for _ in features.images:
-            code = features.another(self._reconstruct, state.code, self._pairs(state), self.constraints.movable)
+            code = features.another(self.reconstruct, state.code, self._pairs(state), self.constraints.movable)
             begun = None if code is None else self.start(code, state.placement, state.shape)
             if begun is None or (moved := self.run(begun, steps, first=False)).cost >= state.cost:
                 break
@@ -234,7 +234,7 @@ class FitSearch:
     def derivatives(self, state: FitState) -> VertexDerivatives:
         """Compute derivatives at a state. Raises NotPositiveDefiniteError."""
         moved = self._changes(self._decoder, state.code)[:, self.constraints.movable]
-        fields = self._reconstruct.differential(state.shape, moved.T)
+        fields = self.reconstruct.differential(state.shape, moved.T)
         moves = carried(self._decoder, self._fine, state.shape, fields)
         return VertexDerivatives(state.code, np.ascontiguousarray(np.moveaxis(moves, 0, -1)), self._accuracy.mesh)
 
@@ -244,7 +244,7 @@ class FitSearch:
         if (
             last is None
             or last.mesh is not self._accuracy.mesh
-            or np.abs(self._whiten @ (state.code - last.code)).max() > SETTINGS.kept
+            or np.abs(self._whiten @ (state.code - last.code)).max() > self._accuracy.kept
         ):
             last = self._last = self.derivatives(state)
         return last.fields

@@ -1,6 +1,15 @@
 """Sizes and thresholds of a fit to a scan."""
 
 from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class Attempt(Enum):
+    """Attempt to improve a poor fit."""
+
+    PULL = auto()  # steps that pull unmatched parts of both sides together
+    EXCHANGE = auto()  # factors get the parts of other codes
+    RESTART = auto()  # more start placements, also of training shapes
 
 
 @dataclass(frozen=True)
@@ -14,9 +23,10 @@ class ScanFitSettings:
         rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
         behind: in the last round, a second start takes part if it costs at most this multiple of the best.
         middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
-        again_steps: further steps with few points if the result is poor.
-        attempts, attempt_steps: attempts to move a limb of the model to one of the scan, and the iterations of each,
-        drawn_steps: of which this number pulls the limb by target points.
+        again_steps: further steps with few points after a feature has moved.
+        attempts, attempt_steps: attempts to improve a poor fit, one after another, and the steps of each,
+        drawn_steps: of which this number pulls unmatched parts together.
+        alike: a training shape at a smaller mean distance from a fit is not tried.
         units, units_of_part: a scan (of a part) that is this many times larger or smaller than the model's shapes is
             taken to be in other units, unless the scale is free.
         missed, unseen: a fit is poor if larger shares of the scan and of the model are far from the other side.
@@ -34,12 +44,16 @@ class ScanFitSettings:
     shape_points: int = 150
     coarse_vertices: int = 500
     fine_vertices: int = 2000
-    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.6, 2), (0.0, 4))
+    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.5, 2), (0.0, 3))
     behind: float = 1.5
     middle_steps: int = 8
     last_steps: int = 6
     again_steps: int = 10
-    attempts: int = 4
+    attempts: tuple[Attempt, ...] = (
+        *2 * (Attempt.PULL, Attempt.EXCHANGE),
+        Attempt.RESTART,
+        *2 * (Attempt.PULL, Attempt.EXCHANGE),
+    )
     attempt_steps: int = 9
     drawn_steps: int = 4
     units: float = 3.0
@@ -48,7 +62,8 @@ class ScanFitSettings:
     unseen: float = 0.008
     missed_of_part: float = 0.03
     restless: float = 5e-3
-    elsewhere: float = 0.05
+    alike: float = 0.003
+    elsewhere: float = 0.01
     nearly: float = 1.1
     beside: float = 3e-3
     mirrored: float = 0.6

@@ -32,7 +32,8 @@ class PlacementEffort:
 
 
 #: Effort for most scans, and for scans of a part: a flat shape looks alike from both sides.
-QUICK = PlacementEffort(points=150, rotations=60, kept=8, polished=12, steps=6, count=5)
+QUICK = PlacementEffort(points=150, rotations=60, kept=8, polished=6, steps=5, count=4)
+MORE = PlacementEffort(points=150, rotations=240, kept=24, polished=24, steps=8, count=12)
 THOROUGH = PlacementEffort(points=300, rotations=240, kept=48, polished=48, steps=20, count=32)
 
 

@@ -10,12 +10,17 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.mesh.rigid_motion import Placement
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.fit_result import FitStatus, Fitted
+from shapespace.model.fit_constraints import FitConstraints
+from shapespace.model.fit_preparation import FitPreparation
+from shapespace.model.fit_result import FitState, FitStatus, Fitted
 from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
-from shapespace.model.options import Landmark
+from shapespace.model.options import FitOptions, Landmark
+from shapespace.model.part_exchange import ShapeJudge
+from shapespace.model.placement import QUICK, PlacementEffort, StartPlacement, start_placements
 from shapespace.model.scan import InvalidScanError, scan_of
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
@@ -98,6 +103,50 @@ def test_a_code_comes_back_from_points_anywhere(plain: Plain, seed: int) -> None
     assert np.linalg.det(found.placement.rotation) == pytest.approx(1)
     # The cost is as documented, counting a rough shape as a third of a solved one.
     assert found.solved + found.rough / 3 < 60
+
+
+def test_a_fit_whose_first_search_ends_in_the_wrong_place_goes_on(
+    figure: ShapeModel, plain: Plain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The first search only knows the body on its head.
+    given, _ = plain(3)
+    turned = Placement(Rotation.random(random_state=3).as_matrix() @ np.diag([1.0, -1.0, -1.0]), np.zeros(3), 1)
+    first = replace(QUICK, count=1)
+
+    def placed(*scan: object, effort: PlacementEffort, **options: bool) -> list[StartPlacement]:
+        found = start_placements(*scan, effort=effort, **options)
+        return found if effort is not first else [max(found_far(*scan, **options), key=apart)]
+
+    def apart(start: StartPlacement) -> float:
+        return -start.placement.angle_to(turned)
+
+    def found_far(*scan: object, **options: bool) -> list[StartPlacement]:
+        return start_placements(*scan, effort=replace(QUICK, count=8), **options)
+
+    monkeypatch.setattr("shapespace.model.fit.QUICK", first)
+    monkeypatch.setattr("shapespace.model.fit.start_placements", placed)
+    found = figure.fit_scan(given.points())
+    assert found.status is FitStatus.CONVERGED, found.reason
+    assert given.error(found) < 2e-3
+    monkeypatch.setattr("shapespace.model.fit.SETTINGS", replace(SETTINGS, attempts=()))
+    assert figure.fit_scan(given.points()).status is FitStatus.POOR
+
+
+def test_a_forearm_gets_another_place_by_an_exchange_of_parts(figure: ShapeModel) -> None:
+    elbow = next(f.start for f in figure.manifest.factors if f.name == "left elbow")
+    code = figure.population.mean.copy()
+    code[elbow] = figure.lower[elbow]
+    wrong = code.copy()
+    wrong[elbow] = figure.upper[elbow]
+    preparation, decoder = FitPreparation(figure.decoder), figure.decoder
+    scan = scan_of(figure.decode(code) / decoder.manifest.scale, figure.faces, np.random.default_rng(0))
+    judge = ShapeJudge(decoder, scan, FitConstraints.of(FitOptions(), decoder))
+    shape = preparation.shapes_of(wrong[None]).shapes[0]
+    with decoder.solver() as reconstruct:
+        found = preparation.exchange(reconstruct, judge, FitState(wrong, shape, Placement(np.eye(3), np.zeros(3), 1)))
+    assert abs(found[elbow] - code[elbow]) < 0.2 * abs(wrong[elbow] - code[elbow])
+    # What is in its place remains there.
+    assert (np.delete(found, elbow) == np.delete(code, elbow)).mean() > 0.7
 
 
 @pytest.mark.parametrize(("seed", "told"), [(3, True), (2, False), pytest.param(1, True, marks=pytest.mark.long)])
@@ -254,7 +303,7 @@ def test_a_mirrored_scan_is_told_so(
     figure: ShapeModel, plain: Plain, monkeypatch: pytest.MonkeyPatch, known: str
 ) -> None:
     # Fixed coordinates of arms and legs distinguish left from right, in a pose that is far from its own mirror image.
-    monkeypatch.setattr("shapespace.model.fit.SETTINGS", replace(SETTINGS, attempts=1))
+    monkeypatch.setattr("shapespace.model.fit.SETTINGS", replace(SETTINGS, attempts=()))
     given, whole = plain(3)
     flip = np.array([-1, 1, 1])
     some = np.linspace(0, len(given.shape) - 1, 6).astype(int)
