@@ -73,8 +73,10 @@ QUICK = $(addprefix tests/,shapespace service/use_cases/test_use_cases.py test_c
 		--ignore tests/shapespace/$(name).py) \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
-# Tests in which the libraries of serving take part: each call, HTTP, the formats. The rest is the same with all versions.
-SERVING = $(filter-out %/test_fit.py %/test_untrusted_clients.py,$(wildcard tests/service/calls/test_*.py tests/service/http/test_*.py)) \
+# Tests in which the libraries of serving take part: each call, HTTP, the formats. The rest is the same with all versions:
+# how good searches and qualities are, and what attacks do.
+SERVING = $(filter-out $(foreach name,encode_status examples fit quality untrusted_clients,%/test_$(name).py), \
+	$(wildcard tests/service/calls/test_*.py tests/service/http/test_*.py)) \
 	tests/service/use_cases/test_use_cases.py tests/service/operation/test_observability.py \
 	$(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading solve/test_cholesky,tests/shapespace/$(name).py)
 

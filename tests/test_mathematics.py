@@ -32,6 +32,7 @@ NO_MATHEMATICS = {
     "shapespace.model.inputs",
     "shapespace.model.latent_space",
     "shapespace.model.memory",
+    "shapespace.model.network_operators",
     "shapespace.model.network_program",
     "shapespace.model.networks",
     "shapespace.model.options",

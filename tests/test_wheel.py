@@ -79,7 +79,7 @@ def test_shapespace_is_alone_at_its_top(wheel: Path) -> None:
         *names
     }
     models = {tuple(name.split("/")[2:-1]) for name in names if name.startswith("shapespace/models/")}
-    assert models == {("figure", "3")}
+    assert models == {("figure", "4")}
     own = {
         path.relative_to(ROOT).as_posix()
         for top in ("shapespace", "shapespace/service", "shapespace/training")

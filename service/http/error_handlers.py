@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import aclosing
 from http import HTTPStatus
 from typing import Any
 
@@ -77,6 +78,19 @@ def install(app: FastAPI) -> None:
 async def domain_problem(request: Request, error: Exception) -> Response:
     """Return one of the DOMAIN_ERRORS as a problem."""
     return problem(request.scope, _KINDS[type(error)], str(error))
+
+
+async def resumed(
+    request: Request, first: bytes, rest: AsyncGenerator[bytes, None], form: bytes
+) -> AsyncGenerator[bytes, None]:
+    """Yield the pieces of a streamed answer in a form such as a line; an error is the last, as the status is sent."""
+    async with aclosing(rest):
+        yield form % first
+        try:
+            async for piece in rest:
+                yield form % piece
+        except DOMAIN_ERRORS as error:
+            yield form % (b'{"problem":%b}' % bytes((await domain_problem(request, error)).body))
 
 
 async def _http(request: Request, error: Exception) -> Response:

@@ -13,7 +13,7 @@ from starlette.types import Receive, Scope, Send
 
 from shapespace.mesh.attributes import Topology
 from shapespace.model.latent_space import CheckedCode
-from shapespace.model.memory import Examples
+from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
@@ -105,6 +105,8 @@ def tag_options(
         options += [colour_by.quantity, against]
     if examples is not True:
         options += ["examples", bytes(examples) if examples else b""]
+        if isinstance(examples, Fade) and quality is not Quality.FULL:
+            options.append(examples.row.tobytes())
     return options if topology is Topology.ORIGINAL else [*options, topology]
 
 

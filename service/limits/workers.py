@@ -98,7 +98,8 @@ class Call(Deadline):
         """Return the result of some work, or raise the error of this call if the call ends first."""
         task = asyncio.ensure_future(work)
         try:
-            await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
+            if not task.done():  # as the turn of most requests is; waiting would take one round of the event loop
+                await asyncio.wait((task, self._over), return_when=asyncio.FIRST_COMPLETED)
             if self._over.done():  # even if the work is done too
                 self._over.result()
             return task.result()

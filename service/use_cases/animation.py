@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field, ValidationError, field_validator, model_
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import LatentSpace
-from shapespace.model.memory import Examples, Fade
+from shapespace.model.memory import FRAMES_PER_RUN, Examples, Fade
 from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
@@ -118,7 +118,7 @@ class Animation(Body):
             return False
         path = self._segments(latents, which)
         first, last = (latents.codes(ends.tolist())[0] for ends in (path.first, path.last))
-        return Fade(first, last, path.share)
+        return Fade(first, last, path.share, path.row)
 
     def _segments(self, latents: LatentSpace, which: slice) -> Fade:
         keyframes = latents.codes(self.keyframes)[0].astype(np.float64)
@@ -130,7 +130,8 @@ class Animation(Body):
         t = knots[0] + self.positions[which] * (knots[-1] - knots[0])
         segment = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
         share = (t - knots[segment]) / (knots[segment + 1] - knots[segment])
-        return Fade(keyframes[segment], keyframes[segment + 1], share)
+        row = np.arange(self.frame_count)[which] % FRAMES_PER_RUN
+        return Fade(keyframes[segment], keyframes[segment + 1], share, row)
 
     def to_id(self, model_digest: str, latents: LatentSpace) -> str:
         """Return an id that holds the whole animation, so that any replica can answer it at any time.

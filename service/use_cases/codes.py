@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, TypeVar
 
@@ -205,8 +206,11 @@ async def fit(
     caller: Caller,
     asked: Asked[FitOptions],
     upload: Upload,
+    progress: Callable[[float], None] | None = None,
 ) -> Found:
     """Find the code, placement and size that explain an uploaded scan; see ShapeModel.fit_scan.
+
+    ``progress`` is called in the thread that computes.
 
     Raises:
         UploadError, InvalidScanError: the scan can't be used.
@@ -218,10 +222,28 @@ async def fit(
         meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
         model, options = asked(fields)
         read = time.perf_counter()
-        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline)
+        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline, progress=progress)
         return found.answer(), {"read": read - began, "search": time.perf_counter() - read}
 
     return await _searched(workers, caller, _SMALLER, make)
+
+
+async def events(search: Callable[[Callable[[float], None]], Awaitable[Found]]) -> AsyncGenerator[bytes, None]:
+    """Yield the progress of a search as JSON, and its answer as the last; raises the error of the search."""
+    loop = asyncio.get_running_loop()
+    waiting = asyncio.Queue[bytes | None]()
+
+    def tell(share: float) -> None:
+        loop.call_soon_threadsafe(waiting.put_nowait, dump_json({"progress": share}))
+
+    work = asyncio.ensure_future(search(tell))
+    work.add_done_callback(lambda _: waiting.put_nowait(None))
+    try:
+        while (event := await waiting.get()) is not None:
+            yield event
+        yield (await work).content
+    finally:
+        work.cancel()
 
 
 async def _searched(workers: Workers, caller: Caller, advice: str, make: Callable[[Deadline], Answered]) -> Found:
@@ -235,7 +257,11 @@ async def _searched(workers: Workers, caller: Caller, advice: str, make: Callabl
         return Found(dump_json(content), seconds)
 
     async with workers.admit(replace(caller, long=True), advice) as call:
-        return await workers.run(search, call)
+        try:
+            return await workers.run(search, call)
+        except asyncio.CancelledError:
+            call.call_off()  # nobody reads the answer
+            raise
 
 
 def _require_few_samples(options: SearchOptions, most: int) -> None:

@@ -189,8 +189,8 @@ async def shapes(
 ) -> ShapeBatch:
     """Return the shapes of codes (n, m), computed in parallel; raises as ``Batch.map``.
 
-    Networks run for several codes at once, which changes the last digits, or for each code ``apart``. ``examples`` is
-    the memory of training shapes.
+    Networks run for several codes at once, which changes the last digits. Codes ``apart``, as the frames of an
+    animation, have the same bytes as alone. ``examples`` is the memory of training shapes.
     """
     vertices = np.empty((len(codes), *model.mesh(mesh).vertices.shape), np.float32)
 
@@ -203,7 +203,7 @@ async def shapes(
             found.append((shape.diagnostics, shape.seconds))
         return found
 
-    batches = (slice(k, k + 1) for k in range(len(codes))) if apart else model.decoder.batches(codes, quality)
+    batches = model.decoder.frames(codes, quality, examples) if apart else model.decoder.batches(codes, quality)
     found = [*chain(*await work.map(find, batches))]
     return ShapeBatch(
         vertices, [diagnostics for diagnostics, _ in found], total_seconds(seconds for _, seconds in found)

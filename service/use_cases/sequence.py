@@ -135,12 +135,13 @@ async def sequence_lines(
             return found, error
         return found, None
 
-    # Each frame has its own deadline, because a stream may take as long as its reader takes.
+    # Each run of frames has its own deadline, because a stream may take as long as its reader takes.
     caller = replace(caller, long=True)
     with workers.stream(caller):
-        # The first frame is computed alone: with the second it would take half as long again.
+        # The first frame is computed alone, so that nobody waits for the others.
         first = slice(0, 1)
-        rest = (slice(k, k + 1) for k in range(1, len(codes)))
+        runs = model.decoder.frames(codes, quality, memory)
+        rest = (slice(max(run.start, 1), run.stop) for run in runs if run.stop > 1)
         ready, error = await workers.piece(partial(lines, first), caller)
         for line in ready:
             yield line

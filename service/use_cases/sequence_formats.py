@@ -64,12 +64,12 @@ class SequenceFormat:
 
 
 def json_line(k: int, t: float, shape: Shape, faces: IntArray | None) -> bytes:
-    """Return one frame as a line of JSON, with the faces if they are given."""
+    """Return one frame as JSON in one line, with the faces if they are given."""
     line: dict[str, Any] = {"frame": k, "t": t}
     if faces is not None:
         line["faces"] = np.ascontiguousarray(faces)
     line |= {"vertices": float32(shape.vertices), "diagnostics": asdict(shape.diagnostics)}
-    return dump_json(line) + b"\n"
+    return dump_json(line)
 
 
 def encode_frames(frames: Frames, format: str) -> tuple[Iterator[Buffer], dict[str, Any]]:

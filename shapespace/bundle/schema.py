@@ -109,10 +109,11 @@ class AutoError(DraftError):
     """Vertex distances between shapes of quality ``auto`` and ``full``, and how Gauss–Newton ends for ``auto``.
 
     A shape is final after a step that moves no vertex further than ``tolerance`` times the diagonal. Null: drafts are
-    accurate enough.
+    accurate enough. Drafts with a relative misfit of at most ``draft_misfit`` are answered as they are.
     """
 
     tolerance: PositiveFloat | None
+    draft_misfit: NonNegativeFloat = 0.0
 
 
 class Origin(_Strict):

@@ -26,6 +26,9 @@ DEFAULT_ETA = 1e-2
 #: Largest relative misfit of a draft. Within the bounds of the bundled models the misfit of a shape from face frames is
 #: 0.004 (figure) to 0.16 (torus). Beyond 0.2 such shapes are off by several percent of their size.
 LARGEST_DRAFT_MISFIT = 0.2
+#: Range of misfits, as a share of the largest one of drafts that are good enough, in which a shape lies between draft
+#: and improved shape. Otherwise a shape would jump where a path of codes enters the range.
+BLENDED = 0.05
 #: Largest number of iterations for one shape.
 MAX_ITERATIONS = 200
 
@@ -40,6 +43,13 @@ class Reconstruction(Outcome):
 
     vertices: FloatArray  # (V, 3), always finite
     flipped_faces: int = 0  # number of faces at edges whose angle differs from the target by more than π/2
+
+
+def improved_share(misfit: float, good_misfit: float) -> float:
+    """Return how much of Gauss–Newton's improvement a draft gets: 0 well below ``good_misfit``, 1 above it."""
+    if misfit >= good_misfit:
+        return 1.0
+    return max(0.0, 1 - (good_misfit - misfit) / (BLENDED * good_misfit))
 
 
 class Reconstructor:
@@ -89,7 +99,11 @@ class Reconstructor:
         return self._nearest(target, integrated, [*(other() for other in others), self.reference.vertices])
 
     def draft(
-        self, target: FloatArray, tolerance: float | None = None, deadline: Deadline | None = None
+        self,
+        target: FloatArray,
+        tolerance: float | None = None,
+        good_misfit: float = 0.0,
+        deadline: Deadline | None = None,
     ) -> Reconstruction | None:
         """Return the shape from face frames; with a tolerance improved by Gauss–Newton.
 
@@ -97,16 +111,30 @@ class Reconstructor:
         coordinates. Gauss–Newton ends once a step moves no vertex further than ``tolerance`` times the reference's
         diagonal; the shape itself is usually closer. Returns None if the misfit of the draft exceeds
         LARGEST_DRAFT_MISFIT, a face is folded over, or Gauss–Newton stalls.
+
+        A draft is not improved if its misfit is at most ``good_misfit``. Just below, it is improved in part, so that
+        shapes change continuously with the code, see BLENDED.
         """
         found = self._squares(self.integrate(target), target)
-        residual, flipped = float(np.sqrt(found.energy / self.norm.square(target))), self._flipped(found.misfit)
+        size = self.norm.square(target)
+        residual, flipped = float(np.sqrt(found.energy / size)), self._flipped(found.misfit)
         if not residual <= LARGEST_DRAFT_MISFIT or flipped:
             return None
-        if tolerance is not None:
-            improved = self._iterate(target, found, tolerance, MAX_ITERATIONS, deadline)
-            return None if improved.status is Status.STALLED else improved
-        return Reconstruction(
+        draft = Reconstruction(
             vertices=found.vertices, status=Status.CONVERGED, residual=residual, flipped_faces=flipped
+        )
+        share = improved_share(residual, good_misfit)
+        if tolerance is None or share == 0:
+            return draft
+        improved = self._iterate(target, found, tolerance, MAX_ITERATIONS, deadline)
+        if improved.status is Status.STALLED:
+            return None
+        if share == 1 or not improved.converged:
+            return improved
+        between = self._squares(found.vertices + share * (improved.vertices - found.vertices), target)
+        residual = float(np.sqrt(between.energy / size))
+        return replace(
+            improved, vertices=between.vertices, residual=residual, flipped_faces=self._flipped(between.misfit)
         )
 
     def nearest(self, target: FloatArray, *shapes: FloatArray) -> FloatArray:

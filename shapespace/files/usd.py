@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,8 +29,9 @@ _TIME = 315_662_400
 _COLOUR = (0.72, 0.76, 0.82)
 
 
+@cache
 def usd_installed() -> bool:
-    """Return whether ``usd-core`` is installed, without importing it, which is slow."""
+    """Return whether ``usd-core`` is installed, without importing it, which is slow. Looked for once."""
     return find_spec("pxr") is not None
 
 

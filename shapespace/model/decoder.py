@@ -21,7 +21,7 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
-from shapespace.model.memory import FACTOR, Examples, Fade, faded, rows_of_segment, switched
+from shapespace.model.memory import FACTOR, Examples, Fade, on_segment, switched
 from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
 from shapespace.model.population import Population
 from shapespace.model.shape import Diagnostics, Quality, Shape
@@ -160,8 +160,21 @@ class Decoder:
 
         Sums in another order change the last digits, so full shapes are computed one by one.
         """
-        size = 1 if quality is Quality.FULL else max(1, BATCH_EDGES // self.manifest.edges)
+        full = self._answered(quality) is Quality.FULL
+        size = 1 if full else max(1, BATCH_EDGES // self.manifest.edges)
         return (slice(k, k + size) for k in range(0, len(codes), size))
+
+    def frames(self, codes: Codes, quality: Quality, memory: Examples) -> Iterator[slice]:
+        """Yield ranges of frames with codes (n, m) for which networks run at once. A frame alone has the same bytes:
+        its run has as many rows, and it has the same row. Without a memory, each frame has a run of its own.
+        """
+        if isinstance(memory, Fade) and self.remembers and self._answered(quality) is not Quality.FULL:
+            return memory.runs()
+        return (slice(k, k + 1) for k in range(len(codes)))
+
+    def _answered(self, quality: Quality) -> Quality:
+        """Return the quality that is computed first: ``full`` for ``auto`` if the bundle has no tolerance."""
+        return Quality.FULL if quality is Quality.AUTO and self.auto is None else quality
 
     def shapes(
         self,
@@ -173,9 +186,12 @@ class Decoder:
         examples: Examples = True,
     ) -> Iterator[Shape]:
         """Decode codes (n, m) one after another; see `shape`, `batches`, and `Examples`."""
-        for some in self.batches(codes, quality):
+        quality = self._answered(quality)
+        whole = isinstance(examples, bool)
+        for some in self.batches(codes, quality) if whole else self.frames(codes, quality, examples):
             began = time.perf_counter()
-            targets = self.targets(codes[some], examples if isinstance(examples, bool) else examples[some])
+            memory = examples if isinstance(examples, bool) else examples[some]
+            targets = self.targets(codes[some], memory, quality)
             seconds = (time.perf_counter() - began) / len(targets)
             for code, target, inside in zip(codes[some], targets, inside_bounds[some], strict=True):
                 yield self._solved(code, target, bool(inside), mesh, deadline, quality, seconds)
@@ -193,13 +209,12 @@ class Decoder:
         """Solve for the shape of one code (m,), whose lengths and angles (2E,) took ``predicting`` seconds."""
         began = time.perf_counter()
         self._require_triangles(target)
-        if quality is Quality.AUTO and self.auto is None:
-            quality = Quality.FULL
         found = None
         with self.solver() as reconstruct:
             if quality is not Quality.FULL:
-                tolerance = self.auto.tolerance if self.auto and quality is Quality.AUTO else None
-                found = reconstruct.draft(target, tolerance, deadline)
+                auto = self.auto if quality is Quality.AUTO else None
+                tolerance, good_misfit = (auto.tolerance, auto.draft_misfit) if auto else (None, 0.0)
+                found = reconstruct.draft(target, tolerance, good_misfit, deadline)
             if found is None:
                 quality = Quality.FULL if quality is Quality.DRAFT else quality
                 limit = MAX_ITERATIONS if inside_bounds or quality is Quality.FULL else ITERATIONS_OUTSIDE
@@ -310,21 +325,16 @@ class Decoder:
         fine = self.finer(mesh)
         return fine.nearby if fine else np.ones(len(self.reference.vertices))
 
-    def targets(self, codes: Codes, examples: Examples) -> FloatArray:
+    def targets(self, codes: Codes, examples: Examples, quality: Quality = Quality.FULL) -> FloatArray:
         """Return combined NRIC (n, 2E), with the memory of training shapes as wanted."""
         if isinstance(examples, Fade):
             if self.remembers:
-                return np.stack([self._on_segment(code, examples[k : k + 1]) for k, code in enumerate(codes)])
+                run, several = lambda *rows: self._networks(*rows)[1], self._answered(quality) is not Quality.FULL
+                ranges = self.frames(codes, quality, examples)
+                return np.concatenate([on_segment(run, codes[some], examples[some], several) for some in ranges])
             examples = True
         factor = None if examples or not self.remembers else np.zeros((1, 1), np.float32)
         return self._networks(codes, factor)[1]
-
-    def _on_segment(self, code: Codes, fade: Fade) -> FloatArray:
-        """Return the NRIC (2E,) of a frame. A keyframe has the bytes of its code alone."""
-        share = float(fade.share[0])
-        if share in {0, 1}:
-            return self._networks(code[None])[1][0]
-        return faded(self._networks(*rows_of_segment(code, fade))[1], share)
 
     def _networks(
         self, codes: Codes, memory: NDArray[np.float32] | None = None

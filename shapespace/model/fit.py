@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -31,6 +31,9 @@ from shapespace.solve.outcome import Status
 
 #: Number of points whose distances are computed at once.
 CHUNK = 50_000
+#: Shares of a fit's time, about: after the start shapes, the search with rough shapes, and the first and all steps with
+#: solved shapes.
+BEGUN, PLACED, NEARLY, REFINED = 0.05, 0.55, 0.7, 0.9
 
 
 class Fitter:
@@ -48,7 +51,12 @@ class Fitter:
         self._features: FeatureSearch | None = None
 
     def __call__(
-        self, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None = None
+        self,
+        points: FloatArray,
+        faces: IntArray,
+        options: FitOptions,
+        deadline: Deadline | None = None,
+        progress: Callable[[float], None] | None = None,
     ) -> Fitted:
         """Fit the model to a scan.
 
@@ -57,13 +65,14 @@ class Fitter:
             faces: (F, 3) faces; F may be 0.
             options: options of the fit.
             deadline: time limit; a fit that exceeds it has FitStatus.DEADLINE.
+            progress: called with the share of the work that is done, in this thread.
 
         Raises:
             InvalidScanError: a scan or an option that can't be used.
             LatentError: fixed coordinates that the model doesn't have, or with which numbers overflow.
             ModelFailedError: the networks failed.
         """
-        return _Fit(self, points, faces, options, deadline)()
+        return _Fit(self, points, faces, options, deadline, progress or (lambda _: None))()
 
     @cached_property
     def reach(self) -> dict[MeshChoice, tuple[VertexFaces, IntArray]]:
@@ -124,8 +133,15 @@ class _Fit:
     """Fit to one scan; arguments as for Fitter."""
 
     def __init__(
-        self, fitter: Fitter, points: FloatArray, faces: IntArray, options: FitOptions, deadline: Deadline | None
+        self,
+        fitter: Fitter,
+        points: FloatArray,
+        faces: IntArray,
+        options: FitOptions,
+        deadline: Deadline | None,
+        progress: Callable[[float], None],
     ) -> None:
+        self.progress, self.done = progress, 0.0
         self.decoder, self.fitter, self.options, self.deadline = fitter.decoder, fitter, options, deadline
         self.searching = deadline and deadline.for_searching()
         self.points, self.unit = points, fitter.decoder.manifest.scale
@@ -137,6 +153,7 @@ class _Fit:
         self.codes, self.shapes = self.fitter.shapes_of(self.fitter.codes(fixed)) if fixed else self.fitter.starts
         if not self.constraints.free:
             self._require_units()
+        self._reach(BEGUN)
         with self.decoder.solver() as reconstruct:
             rough = self._search(reconstruct, self.scan, self.constraints, ROUGH)
             self.features = self.fitter.features(reconstruct)
@@ -144,6 +161,7 @@ class _Fit:
             full = self._search(reconstruct, self.scan, self.constraints, SOLVED)
             middle = self._search(reconstruct, self.scan, self.constraints, MIDDLE)
             final, rival = self._fully(middle, full, best, others)
+            self._reach(REFINED)
             self.ended = self._late
             ratio = None
             posterior = self._posterior(full, final)
@@ -157,6 +175,12 @@ class _Fit:
         # The solver is returned first: decoding the result needs a solver too.
         counts = full.count + middle.count, rough.count
         return self._answer(full, final, posterior, explained, seen, ratio, rival, counts)
+
+    def _reach(self, share: float) -> None:
+        """Tell that a share of the work is done; further attempts at a poor fit do not lower it."""
+        if share > self.done:
+            self.done = share
+            self.progress(share)
 
     @property
     def _late(self) -> bool:
@@ -224,11 +248,15 @@ class _Fit:
     def _followed(self, search: FitSearch, effort: PlacementEffort) -> list[FitState]:
         """Return fits with rough shapes from the start placements, the best first."""
         states = [self._start(search, start) for start in self._placed(search, effort)]
+        done, most = 0, sum(max(2, round(part * len(states))) * steps for part, steps in SETTINGS.rounds)
         for part, steps in SETTINGS.rounds:
             some = states[: max(2, round(part * len(states)))]
             if part == 0 and some[-1].cost > SETTINGS.behind * some[0].cost:
                 some.pop()
-            states[: len(some)] = [search.run(state, steps, first=True) for state in some]
+            for k, state in enumerate(some):
+                states[k] = search.run(state, steps, first=True)
+                done += steps
+                self._reach(BEGUN + (PLACED - BEGUN) * done / most)
             states.sort(key=lambda state: state.cost)
         return states
 
@@ -251,7 +279,10 @@ class _Fit:
         begun = middle.start(best.code, best.placement, best.shape)
         if begun is None:
             return best, None
-        final = search.run(middle.run(begun, SETTINGS.middle_steps, first=False), SETTINGS.last_steps, first=False)
+        self._reach(PLACED)
+        nearly = middle.run(begun, SETTINGS.middle_steps, first=False)
+        self._reach(NEARLY)
+        final = search.run(nearly, SETTINGS.last_steps, first=False)
         if not self._late and self._is_poor(*search.shares(final)):
             again = middle.with_moved_feature(middle.run(final, 0, first=False), self.features, SETTINGS.again_steps)
             if self._is_poor(*middle.shares(again)):

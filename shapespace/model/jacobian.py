@@ -10,7 +10,8 @@ from shapespace.arrays import FloatArray
 from shapespace.model.decoder import TOLERANCE, Decoder, MeshChoice
 from shapespace.model.derivatives import carried
 from shapespace.model.latent_space import Codes, LatentError
-from shapespace.model.network_program import NetworkProgram, NumPyOperations
+from shapespace.model.network_operators import NumPyOperations
+from shapespace.model.network_program import NetworkProgram
 from shapespace.model.shape import Quality
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 

@@ -11,7 +11,8 @@ class Quality(StrEnum):
     """Accuracy of a shape.
 
     ``full``: Gauss–Newton until no vertex moves. ``draft``: from face frames alone, in a fraction of the time.
-    ``auto``: the draft, improved by the few Gauss–Newton steps that bring it closer to the exact shape. The remaining
+    ``auto``: the draft, improved by the few Gauss–Newton steps that bring it closer to the exact shape, or as it is if
+    the model's ``auto_error`` says that drafts with its misfit are close enough. The remaining
     steps of ``full`` are smaller than the error of the networks.
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -53,7 +53,7 @@ def load(folder: str | os.PathLike[str], threads: int = 1) -> ShapeModel:
 
     >>> import shapespace
     >>> shapespace.load("figure")
-    <ShapeModel figure/3: 20 coordinates, 10 factors, 4601 vertices>
+    <ShapeModel figure/4: 20 coordinates, 10 factors, 4601 vertices>
     """
     return ShapeModel(read_bundle(find_bundle(folder)), threads)
 
@@ -356,7 +356,13 @@ class ShapeModel:
 
     @OneBlasThread()
     def fit_scan(
-        self, scan: ScanLike, options: FitOptions | None = None, *, deadline: Deadline | None = None, **changes: Any
+        self,
+        scan: ScanLike,
+        options: FitOptions | None = None,
+        *,
+        deadline: Deadline | None = None,
+        progress: Callable[[float], None] | None = None,
+        **changes: Any,
     ) -> Fitted:
         """Find the code of a scan: points or a mesh without correspondence, whole or in part, in any pose, with noise.
 
@@ -365,6 +371,7 @@ class ShapeModel:
                 file. In the units of the training meshes unless the scale is free.
             options: options of the fit.
             deadline: time limit after which the status is "deadline".
+            progress: called from time to time with the share of the work that is done.
             changes: single options by name, for example ``partial=True``; see FitOptions.
 
         Returns:
@@ -387,7 +394,7 @@ class ShapeModel:
         >>> bool(np.abs(there - model.decode(code) - [3, 0, 1]).max() < 0.01)
         True
         """
-        return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), deadline)
+        return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), deadline, progress)
 
     fit = fit_scan  # The old name remains for one release.
 

@@ -91,7 +91,7 @@ class ShapeLayer(nn.Module):
 
     >>> import torch
     >>> from shapespace.torch import ShapeLayer
-    >>> layer = ShapeLayer("models/figure/3")
+    >>> layer = ShapeLayer("models/figure/4")
     >>> codes = torch.zeros(2, 20, requires_grad=True)
     >>> positions = layer(codes)
     >>> positions.shape, layer.faces.shape

@@ -17,7 +17,7 @@ from shapespace.torch.arrays import ArrayModule
 
 
 class TorchOperations:
-    """Operations on tensors; see network_program.Operations."""
+    """Operations on tensors; see network_operators.Operations."""
 
     functions = torch
 

@@ -8,7 +8,6 @@ import select
 import shutil
 import signal
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from tempfile import TemporaryDirectory
 
 import httpx
 
+from tests.fuzz.meters import Peaks, ProcessorClock
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server
 from tests.service.watching import processes
@@ -123,9 +123,6 @@ class Measured(Server):
         settings: as of Server.
     """
 
-    #: Bytes of the smallest child process ever seen between two requests.
-    children = 0
-
     def __init__(self, models: Path, deadline: float, **settings: object) -> None:
         self._folder = TemporaryDirectory()
         self._meter = str(Path(self._folder.name, "meter"))
@@ -203,7 +200,7 @@ class Measured(Server):
         """Send a request, without others at the same time, and measure its cost."""
         cost = Cost(name, seed)
         self.ask("reset")
-        computing, peaks = self.computing(), Peaks(self)
+        computing, peaks = self.computing(), Peaks(self.process.pid)
         with peaks.watching():
             self.exchange(request, cost)
             if not self.settle():
@@ -275,85 +272,6 @@ class Measured(Server):
         if not cost.faults and not cost.statuses and not request.broken:
             cost.faults.append("the connection was closed without an answer")
         cost.faults += [f"status {status}" for status in cost.statuses if status >= 500 and status not in _BUSY]
-
-
-class ProcessorClock:
-    """Seconds since its creation, less those in which this thread or a server's waited for a processor."""
-
-    def __init__(self, pid: int) -> None:
-        self._places = ("/proc/thread-self/schedstat", f"/proc/{pid}/schedstat")
-        self._began, self._waited = time.monotonic(), [0.0, 0.0]
-        self._waited = self._waiting()
-
-    def _waiting(self) -> list[float]:
-        waited = []
-        for place, before in zip(self._places, self._waited, strict=True):
-            try:
-                waited.append(int(Path(place).read_text().split()[1]) / 1e9)
-            except OSError:  # it has ended
-                waited.append(before)
-        return waited
-
-    @property
-    def seconds(self) -> float:
-        """Only the longer of both waits is subtracted: usually one thread waits while the other runs."""
-        waited = max(now - before for now, before in zip(self._waiting(), self._waited, strict=True))
-        return time.monotonic() - self._began - waited
-
-
-class Peaks:
-    """The growth of a group of processes' memory, together, from its creation to the peak.
-
-    The kernel keeps the peak of each process (VmHWM), which is reset at every reading: the sum of the peaks
-    between two readings is never less than the true common peak, and hardly more. For a process that starts
-    later, growth is counted from the smallest size of other children before a request, or without these
-    from its first reading.
-    """
-
-    def __init__(self, server: Measured) -> None:
-        self._server = server
-        self._before: dict[int, int] = {}
-        #: Bytes, of all processes together.
-        self.growth = 0
-        for pid in server.pids:
-            with contextlib.suppress(OSError):
-                self._before[pid] = self._read(pid)["VmRSS"]
-        children = [size for pid, size in self._before.items() if pid != server.process.pid]
-        Measured.children = min([*children, Measured.children]) if Measured.children else min(children, default=0)
-
-    @staticmethod
-    def _read(pid: int) -> dict[str, int]:
-        status = Path(f"/proc/{pid}/status").read_text()
-        Path(f"/proc/{pid}/clear_refs").write_text("5")
-        found = re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", status)
-        return {name: int(size) * 1024 for name, size in found} or {"VmHWM": 0, "VmRSS": 0}
-
-    @contextlib.contextmanager
-    def watching(self) -> Iterator[None]:
-        """Read regularly meanwhile, as a process that ends leaves no reading."""
-        done = threading.Event()
-
-        def look() -> None:
-            while not done.wait(0.002):
-                self._look()
-
-        thread = threading.Thread(target=look)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
-            self._look()
-
-    def _look(self) -> None:
-        total = 0
-        for pid in self._server.pids:
-            with contextlib.suppress(OSError):
-                now = self._read(pid)
-                before = self._before.setdefault(pid, max(now["VmRSS"], self._server.children))
-                total += max(0, now["VmHWM"] - before)
-        self.growth = max(self.growth, total)
 
 
 class CostTrial:

@@ -36,7 +36,7 @@ from shapespace.service.use_cases.animation import Animation, UnknownInterpolati
 from shapespace.service.use_cases.uploads import UploadError, read_mesh_files
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
-from tests.hostile import BINARY, MATRIX, document, glb
+from tests.gltf_documents import BINARY, MATRIX, document, glb
 from tests.service.bundles import reference, seal, write_bundle
 
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "0"))

@@ -1,4 +1,4 @@
-"""One server for all tests of the page, a browser for each file of tests, and a new window for each test."""
+"""One server for all tests of the page; a browser and a loaded page for each file of tests."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -19,10 +19,13 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 #: WebGL in software, which works on every machine.
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
+#: Width and height of a window.
+SIZE = (1000, 640)
 #: A code of the small torus.
 CODE = (0.1, 1, 0.5)
 
 Open = Callable[..., OpenPage]
+Visit = Callable[..., OpenPage]
 
 
 @pytest.fixture(scope="session")
@@ -52,30 +55,58 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
+def _opened(browser: Browser, url: str, options: dict[str, Any]) -> OpenPage:
+    usual = {"viewport": dict(zip(("width", "height"), SIZE, strict=True)), "reduced_motion": "reduce"}
+    return OpenPage(browser.new_context(**{**usual, **options}).new_page(), url)
+
+
 @pytest.fixture
 def window(browser: Browser, server: Server) -> Iterator[Open]:
-    """Opens windows; checks at the end that none had errors or sent requests to another host."""
+    """Opens new windows; checks at the end that none had errors or sent requests to another host."""
     windows: list[tuple[OpenPage, bool]] = []
 
     def open(url: str = server.url, *, complains: bool = False, **options: Any) -> OpenPage:
-        context = browser.new_context(
-            **{"viewport": {"width": 1000, "height": 640}, "reduced_motion": "reduce", **options}
-        )
-        studio = OpenPage(context.new_page(), url)
-        windows.append((studio, complains))
-        return studio
+        windows.append((_opened(browser, url, options), complains))
+        return windows[-1][0]
 
     yield open
     for studio, complains in windows:
         studio.page.context.close()
-        assert studio.foreign == []
-        assert complains or studio.complaints == []
+        studio.require_calm(complains)
+
+
+@pytest.fixture(scope="module")
+def shared(browser: Browser, server: Server) -> list[OpenPage]:
+    """The window that the tests of a file use one after the other."""
+    return [_opened(browser, server.url, {})]
 
 
 @pytest.fixture
-def studio(window: Open) -> OpenPage:
+def visit(request: pytest.FixtureRequest, browser: Browser, server: Server, shared: list[OpenPage]) -> Iterator[Visit]:
+    """Shows an address on the page that earlier tests of the file have loaded, as if it were new.
+
+    Loading takes seconds, most of them in software for WebGL. Tests that need a new page use `window`.
+    """
+    failed, complaining = request.session.testsfailed, False
+
+    def visit(hash: str = "#model=with-fine", *, size: tuple[int, int] = SIZE, complains: bool = False) -> OpenPage:
+        nonlocal complaining
+        complaining = complains
+        return shared[0].visit(hash, size)
+
+    yield visit
+    studio = shared[0]
+    if request.session.testsfailed > failed:  # who knows what it has left behind
+        studio.page.context.close()
+        shared[0] = _opened(browser, server.url, {})
+    else:
+        studio.require_calm(complaining)
+
+
+@pytest.fixture
+def studio(visit: Visit) -> OpenPage:
     """The page with the small torus, after its shape has been drawn."""
-    return window().open()
+    return visit()
 
 
 @pytest.fixture

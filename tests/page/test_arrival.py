@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from tests.page.conftest import Open
-from tests.page.studio import Hold
+from tests.page.studio import Hold, slow_down
 
 
 def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open) -> None:
@@ -32,6 +32,28 @@ def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open
     assert not studio.waits
     # The first draft is not requested again.
     assert [body for body in studio.asked if body == asked[0]] == asked
+
+
+#: Notes whether a notice was seen at any time before the first shape.
+WATCH = """
+window.seen = new Set();
+const watch = () => {
+    for (const id of ['without', 'lost']) {
+        if (document.getElementById(id)?.checkVisibility()) window.seen.add(id);
+    }
+    if (!document.querySelector('.stage')?.dataset.shown) requestAnimationFrame(watch);
+};
+watch();
+"""
+
+
+def test_on_a_slow_line_nothing_is_said_until_the_shape_is_there(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script(f"{{ {WATCH} }}")
+    slow_down(studio.page)
+    studio.open("#model=figure")
+    assert studio.page.evaluate("[...window.seen]") == []
+    assert studio.messages == ""
 
 
 def test_a_script_that_does_not_arrive_is_told_with_a_way_out(window: Open) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
-from tests.page.conftest import CODE, Open
+from tests.page.conftest import CODE, Visit
 from tests.page.studio import OpenPage
 from tests.service.conftest import Server
 
@@ -43,8 +43,8 @@ def test_a_file_is_encoded(studio: OpenPage, expected: np.ndarray, server: Serve
     studio.until_code(CODE, 0.02)
 
 
-def test_a_file_that_is_none_is_refused_in_the_page(window: Open) -> None:
-    studio = window(complains=True).open()  # the browser logs every refused request in its console
+def test_a_file_that_is_none_is_refused_in_the_page(visit: Visit) -> None:
+    studio = visit(complains=True)  # the browser logs every refused request in its console
     studio.tab("Files")
     studio["#mesh-file"].set_input_files({"name": "x.obj", "mimeType": "model/obj", "buffer": b"v 0 0 0\n"})
     message = studio.eventually(lambda: studio["#messages .error"].first.inner_text() or None)

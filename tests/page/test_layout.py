@@ -3,16 +3,23 @@
 import numpy as np
 import pytest
 
-from tests.page.conftest import Open
+from tests.page.conftest import Visit
 from tests.page.studio import pixels
 
 
 @pytest.mark.parametrize(
     ("width", "height", "least"),
-    [(390, 844, 0.35), (640, 360, 0.45), (320, 568, 0.25), (1440, 900, 0.65), (844, 390, 0.45)],
+    [
+        (390, 844, 0.35),
+        (844, 390, 0.45),
+        *(
+            pytest.param(*some, marks=pytest.mark.long)
+            for some in ((640, 360, 0.45), (320, 568, 0.25), (1440, 900, 0.65))
+        ),
+    ],
 )
-def test_the_figure_is_large_and_nothing_lies_over_it(window: Open, width: int, height: int, least: float) -> None:
-    studio = window(viewport={"width": width, "height": height}).open("#model=figure")
+def test_the_figure_is_large_and_nothing_lies_over_it(visit: Visit, width: int, height: int, least: float) -> None:
+    studio = visit("#model=figure", size=(width, height))
     stage = studio[".stage"].bounding_box()
     assert stage
     assert stage["height"] >= 0.48 * height

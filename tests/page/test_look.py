@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import OpenPage, difference, pixels
 
 
@@ -46,7 +46,7 @@ def test_the_turntable_turns_until_the_shape_is_touched(studio: OpenPage) -> Non
     assert studio["#spin"].get_attribute("aria-pressed") == "false"
     studio.eventually(lambda: "view" in studio.hash)
     still = studio.picture()
-    studio.page.wait_for_timeout(300)
+    studio.frames(10)
     assert difference(still, studio.picture()) == 0
     studio["#reset-view"].click()
     studio["#theme"].focus()  # so that the canvas has no focus ring
@@ -94,8 +94,8 @@ def test_a_shape_keeps_its_colour_while_a_slider_is_dragged(studio: OpenPage) ->
     studio.page.mouse.up()
 
 
-def test_sliders_are_named_by_their_motion(window: Open) -> None:
-    studio = window().open("#model=figure")
+def test_sliders_are_named_by_their_motion(visit: Visit) -> None:
+    studio = visit("#model=figure")
     names = studio[".coordinate .name"]
     studio.eventually(lambda: "↔" in (names.nth(19).text_content() or ""), 300)
     told = names.all_text_contents()

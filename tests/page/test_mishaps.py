@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Route
 
-from tests.page.conftest import CHROMIUM, Open
+from tests.page.conftest import CHROMIUM, Open, Visit
 from tests.page.studio import OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
@@ -99,7 +99,7 @@ def test_a_second_click_on_play_waits_for_the_same_frames(studio: OpenPage) -> N
     studio["#play"].click()
     studio.eventually(lambda: bool(held))
     studio["#play"].click()
-    studio.page.wait_for_timeout(200)
+    studio.frames(3)
     held[0].continue_()
     studio.eventually(lambda: frames[:3] == [12, 12, 1])
     studio.eventually(lambda: studio["#time"].inner_text() == "t = 1.00")
@@ -107,8 +107,8 @@ def test_a_second_click_on_play_waits_for_the_same_frames(studio: OpenPage) -> N
 
 
 @pytest.mark.parametrize("width", [1000, 390])
-def test_numbers_are_not_cut(window: Open, width: int) -> None:
-    studio = window(viewport={"width": width, "height": 760}).open()
+def test_numbers_are_not_cut(visit: Visit, width: int) -> None:
+    studio = visit(size=(width, 760))
     box = studio.coordinate(1).locator("input[type=number]")
     box.fill("-3.1234")
     assert box.evaluate("b => b.scrollWidth <= b.clientWidth")
@@ -116,7 +116,8 @@ def test_numbers_are_not_cut(window: Open, width: int) -> None:
     assert not box.evaluate(script), "the measurement must detect a number that is cut off"
 
 
-def test_theme_tab_and_seed_survive_a_reload(studio: OpenPage) -> None:
+def test_theme_tab_and_seed_survive_a_reload(window: Open) -> None:
+    studio = window().open()
     before = studio["html"].evaluate("e => getComputedStyle(e).colorScheme")
     studio["#theme"].click()
     studio["#seed"].fill("41")
@@ -149,9 +150,12 @@ def test_ten_arrow_keys_are_one_step(studio: OpenPage) -> None:
     studio.eventually(lambda: "3 steps" in (studio["#undo"].get_attribute("title") or ""))
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 760), (500, 320), (320, 640), (1000, 640)])
-def test_legend_and_diagnostics_lie_apart(window: Open, width: int, height: int) -> None:
-    studio = window(viewport={"width": width, "height": height}).open("#model=with-fine&z=0.4,0,2&colour=stretch")
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [(390, 760), (500, 320), *(pytest.param(*some, marks=pytest.mark.long) for some in ((320, 640), (1000, 640)))],
+)
+def test_legend_and_diagnostics_lie_apart(visit: Visit, width: int, height: int) -> None:
+    studio = visit("#model=with-fine&z=0.4,0,2&colour=stretch", size=(width, height))
     studio.eventually(lambda: studio["#legend"].is_visible() and studio["#diagnostics li"].count() > 1)
     boxes = [studio[name].bounding_box() for name in (".tools", "#legend", "#diagnostics")]
     for i, a in enumerate(boxes):

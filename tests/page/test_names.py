@@ -1,6 +1,6 @@
 """Names that users give to factors and coordinates."""
 
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import OpenPage
 from tests.page.test_operation import AXE, check
 
@@ -9,8 +9,8 @@ def headings(studio: OpenPage) -> list[str]:
     return studio[".factor h2"].all_inner_texts()
 
 
-def test_people_name_things_for_themselves(window: Open) -> None:
-    studio = window().open()
+def test_people_name_things_for_themselves(visit: Visit) -> None:
+    studio = visit()
     own = headings(studio)
     slider = studio.coordinate(1).locator("input[type=range]")
     before = slider.get_attribute("aria-label")

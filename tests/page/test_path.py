@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Route
 
-from tests.page.conftest import Open
+from tests.page.conftest import Visit
 from tests.page.studio import OpenPage, body, difference
 
 #: Presses play and, once the time has moved on, pause; run in the page, so that a busy machine doesn't press too late.
@@ -122,7 +122,7 @@ def test_frames_are_played_as_they_come(studio: OpenPage) -> None:
     studio["#play"].click()
     studio.eventually(lambda: bool(held) and time() > 0.3)
     assert "Pause" in studio["#play"].inner_text()
-    studio.page.wait_for_timeout(500)
+    studio.frames(30)
     assert time() <= 11 / 24 + 0.01, "it shows frames that haven't arrived"
     held[0].continue_()
     studio.eventually(lambda: time() == 1)
@@ -130,8 +130,8 @@ def test_frames_are_played_as_they_come(studio: OpenPage) -> None:
     assert status() == ""
 
 
-def test_frames_that_never_come_are_told_and_can_be_asked_for_again(window: Open) -> None:
-    studio = window(complains=True).open("#model=with-fine&keys=-0.2,0,0;0.2,0,1")
+def test_frames_that_never_come_are_told_and_can_be_asked_for_again(visit: Visit) -> None:
+    studio = visit("#model=with-fine&keys=-0.2,0,0;0.2,0,1", complains=True)
     studio.tab("Path")
 
     def refuse(route: Route) -> None:
@@ -149,10 +149,17 @@ def test_frames_that_never_come_are_told_and_can_be_asked_for_again(window: Open
     studio.until_code([0.2, 0, 1])
 
 
-@pytest.mark.parametrize("path", ["beyond=0", "beyond=0.25", "beyond=0.25&easing=soft", "show=loop&easing=soft"])
-def test_a_saved_path_goes_where_the_player_goes(window: Open, path: str) -> None:
+@pytest.mark.parametrize(
+    "path",
+    [
+        "beyond=0.25&easing=soft",
+        "show=loop&easing=soft",
+        *(pytest.param(some, marks=pytest.mark.long) for some in ("beyond=0", "beyond=0.25")),
+    ],
+)
+def test_a_saved_path_goes_where_the_player_goes(visit: Visit, path: str) -> None:
     codes = "0,3,0;0.1,-2.7,1;-0.1,-2,0.5;0.2,1,0.2"
-    studio = window().open(f"#model=with-fine&z=0,0,0.7&keys={codes}&{path}")
+    studio = visit(f"#model=with-fine&z=0,0,0.7&keys={codes}&{path}")
     studio.tab("Path")
     studio.eventually(lambda: studio["#animation-format option"].count() > 0)
     studio["#animation-format"].select_option("npz")

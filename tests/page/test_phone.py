@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import OpenPage
 
 #: How many sliders can be seen and touched.
@@ -17,7 +17,7 @@ def sliders(studio: OpenPage) -> int:
     return int(studio[".coordinate input[type=range]"].evaluate_all(SLIDERS))
 
 
-@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (640, 400)])
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), pytest.param(640, 400, marks=pytest.mark.long)])
 def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: int) -> None:
     options = {"viewport": {"width": width, "height": height}, "has_touch": True, "is_mobile": width != 640}
     studio = window(**options).open("#model=figure")
@@ -50,8 +50,8 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
     studio.eventually(studio["#card"].is_visible)
 
 
-def test_the_sheet_is_dragged_pressed_and_moved_by_keys(window: Open) -> None:
-    studio = window(viewport={"width": 390, "height": 844}).open()
+def test_the_sheet_is_dragged_pressed_and_moved_by_keys(visit: Visit) -> None:
+    studio = visit(size=(390, 844))
     handle = studio["#sheet"]
 
     def drag(by: float) -> tuple[float, str | None]:
@@ -80,7 +80,7 @@ def test_the_sheet_is_dragged_pressed_and_moved_by_keys(window: Open) -> None:
     assert handle.get_attribute("aria-valuenow") == "0"
 
 
-def test_where_the_page_scrolls_a_finger_on_the_shape_scrolls_it(window: Open) -> None:
-    studio = window(viewport={"width": 320, "height": 480}).open()
+def test_where_the_page_scrolls_a_finger_on_the_shape_scrolls_it(visit: Visit) -> None:
+    studio = visit(size=(320, 480))
     assert studio["#canvas"].evaluate("c => getComputedStyle(c).touchAction") == "pan-y"
     assert studio.page.evaluate("document.documentElement.scrollHeight > innerHeight")

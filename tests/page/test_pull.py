@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import Locator
 
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import Hold, OpenPage, difference
 from tests.page.test_operation import AXE, check
 
@@ -44,8 +44,8 @@ def corners(pins: Locator) -> list[list[float]]:
     )
 
 
-def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open) -> None:
-    studio = window().open("#model=figure")
+def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(visit: Visit) -> None:
+    studio = visit("#model=figure")
     sent = edits(studio)
     studio["#pull"].click()
     first, second = hand(studio), hand(studio, right=False)
@@ -77,7 +77,7 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     studio.rest()
     studio.eventually(lambda: pins.count() == 2)
     studio.eventually(lambda: np.allclose(corners(pins), places, atol=2))
-    studio.page.wait_for_timeout(400)
+    studio["#share"].click()  # which writes the address at once
     assert studio.hash == address
 
     # A single pin can be dragged further.
@@ -97,12 +97,12 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(window: Open
     assert studio["#canvas"].evaluate("c => document.activeElement === c")
 
 
-def test_a_press_pins_a_place_and_undo_takes_pins_along(window: Open) -> None:
-    studio = window().open("#model=figure")
+def test_a_press_pins_a_place_and_undo_takes_pins_along(visit: Visit) -> None:
+    studio = visit("#model=figure")
     studio["#pull"].click()
     studio.page.mouse.click(*hand(studio, right=False))
-    studio.page.wait_for_timeout(100)
-    assert studio[".pin"].count() == 1
+    studio.eventually(lambda: studio[".pin"].count() == 1)
+    studio["#share"].click()  # which writes the address at once
     assert not any(studio.code)
     pull(studio, hand(studio), (20, -25))
     studio.eventually(lambda: any(studio.code))
@@ -117,9 +117,9 @@ def test_a_press_pins_a_place_and_undo_takes_pins_along(window: Open) -> None:
     assert studio[".pin"].count() == 0
 
 
-def test_what_is_locked_stays_though_something_else_is_pulled(window: Open) -> None:
+def test_what_is_locked_stays_though_something_else_is_pulled(visit: Visit) -> None:
     locked = [k for k in range(20) if k != 7]  # all but a leg
-    studio = window().open(f"#model=figure&locked={','.join(map(str, locked))}")
+    studio = visit(f"#model=figure&locked={','.join(map(str, locked))}")
     before = studio.picture()
     sent = edits(studio)
     studio["#pull"].click()
@@ -136,8 +136,8 @@ def test_what_is_locked_stays_though_something_else_is_pulled(window: Open) -> N
     studio.eventually(lambda: difference(before, studio.picture()) < 0.001)
 
 
-def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happens(window: Open) -> None:
-    studio = window().open("#model=figure")
+def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happens(visit: Visit) -> None:
+    studio = visit("#model=figure")
     studio["#pull"].click()
     mouse = studio.page.mouse
     x, y = hand(studio)
@@ -186,9 +186,9 @@ def test_a_finger_pulls_and_a_second_one_does_not_turn_the_view(window: Open) ->
 
 
 def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_a_double_click(
-    window: Open,
+    visit: Visit,
 ) -> None:
-    studio = window().open("#model=figure")
+    studio = visit("#model=figure")
     mouse = studio.page.mouse
     box = studio["#canvas"].bounding_box()
     assert box
@@ -208,10 +208,10 @@ def test_the_camera_stays_above_the_ground_zooms_to_the_pointer_and_sees_all_by_
     studio["#canvas"].focus()
     for _ in range(3):
         studio.page.keyboard.press("ArrowDown")
-    studio.page.wait_for_timeout(300)
+    studio["#share"].click()  # which writes the address at once
     assert view()[0][1] >= view()[1][1] - 1e-4
 
-    studio.page.keyboard.press("0")
+    studio["#canvas"].press("0")
     studio.eventually(lambda: "view" not in studio.hash)
     studio["#theme"].focus()  # so that the canvas has no focus ring
     x, y = hand(studio)

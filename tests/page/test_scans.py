@@ -1,5 +1,6 @@
 """Files not in correspondence: scans shown over the shape, verdicts, and undo."""
 
+import json
 import re
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from shapespace.arrays import FloatArray
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
-from tests.page.conftest import Open
+from tests.page.conftest import Visit
 from tests.page.studio import OpenPage, difference
 from tests.page.test_operation import AXE, check
 from tests.service.conftest import Server
@@ -48,6 +49,15 @@ def given(server: Server) -> Given:
     return Given(*read_arrays(httpx.get(call, timeout=60).raise_for_status().content, "npz"))
 
 
+#: Notes all values of the progress bar.
+WATCH_PROGRESS = """() => {
+    window.shares = [];
+    const bar = document.querySelector('#verdict progress');
+    const note = () => bar.hasAttribute('value') && window.shares.push(bar.value);
+    new MutationObserver((changes) => note()).observe(bar, { attributeFilter: ['value'] });
+}"""
+
+
 def choose(studio: OpenPage, file: object) -> None:
     studio.tab("Files")
     studio["#mesh-file"].set_input_files(file)  # type: ignore[arg-type]
@@ -72,8 +82,8 @@ def ghost(studio: OpenPage) -> float:
 
 
 @pytest.mark.parametrize("name", ["scan.ply", pytest.param("points.xyz", marks=pytest.mark.long)])
-def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, name: str) -> None:
-    studio = window(complains=name.endswith("ply")).open(FIGURE)  # the console logs that `encode` refuses it
+def test_a_scan_is_fitted_and_lies_over_its_shape(visit: Visit, given: Given, name: str) -> None:
+    studio = visit(FIGURE, complains=name.endswith("ply"))  # the console logs that `encode` refuses it
     start = studio.picture()
     choose(studio, given.file(name))
     words = until_said(studio, f"Figure fits {name}")
@@ -107,8 +117,8 @@ def test_a_scan_is_fitted_and_lies_over_its_shape(window: Open, given: Given, na
 
 
 @pytest.mark.long
-def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Open, given: Given) -> None:
-    studio = window(complains=True).open(FIGURE)
+def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(visit: Visit, given: Given) -> None:
+    studio = visit(FIGURE, complains=True)
     assert studio["#sure"].is_hidden()
     up = given.vertices[:, 1]
     seen = (up > np.quantile(up, 0.25))[given.faces].all(axis=1)  # not the lower legs
@@ -146,8 +156,8 @@ def test_how_sure_the_shape_of_a_scan_is_shows_where_it_was_not_seen(window: Ope
     assert studio["#sure"].is_hidden()
 
 
-def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) -> None:
-    studio = window(complains=True).open(FIGURE)
+def test_other_units_are_told_and_the_size_is_found(visit: Visit, given: Given) -> None:
+    studio = visit(FIGURE, complains=True)
     choose(studio, given.file("millimetres.stl", scale=1000))
     words = until_said(studio, "other units")
     assert "times as large as the shapes of Figure" in words
@@ -162,8 +172,8 @@ def test_other_units_are_told_and_the_size_is_found(window: Open, given: Given) 
 
 
 @pytest.mark.long
-def test_what_is_no_such_shape_leaves_the_user_their_own(window: Open) -> None:
-    studio = window().open(FIGURE)
+def test_what_is_no_such_shape_leaves_the_user_their_own(visit: Visit) -> None:
+    studio = visit(FIGURE)
     studio.type(4, 0.3)
     mine = [0.3 if k == 4 else 0 for k in range(20)]
     studio.until_code(mine)
@@ -180,8 +190,8 @@ def test_what_is_no_such_shape_leaves_the_user_their_own(window: Open) -> None:
     studio.until_code(mine)
 
 
-def test_a_fit_keeps_what_is_locked_and_can_be_given_up(window: Open, given: Given) -> None:
-    studio = window().open(f"{FIGURE}&locked=0,1,2&z={','.join(['0.1'] * 3 + ['0'] * 17)}")
+def test_a_fit_keeps_what_is_locked_and_can_be_given_up(visit: Visit, given: Given) -> None:
+    studio = visit(f"{FIGURE}&locked=0,1,2&z={','.join(['0.1'] * 3 + ['0'] * 17)}")
     held: list[Route] = []
     studio.page.route("**/fit?*", lambda route: held.append(route) or None)
     choose(studio, given.file("points.xyz"))
@@ -190,20 +200,28 @@ def test_a_fit_keeps_what_is_locked_and_can_be_given_up(window: Open, given: Giv
     studio.page.get_by_role("button", name="Cancel").click()
     assert studio["#verdict"].is_hidden()
     studio.page.unroute("**/fit?*")
+    studio.page.evaluate(WATCH_PROGRESS)
     choose(studio, given.file("points.xyz"))
     studio.eventually(lambda: studio["#verdict"].is_visible() and studio["#verdict progress"].is_hidden())
+    shares = studio.page.evaluate("shares")
+    assert len(shares) > 3, "the server tells how far it is"
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < shares[-1] < 1
     studio.page.get_by_role("button", name="Show what was found").or_(
         studio.page.get_by_role("button", name="Back to my shape")
     ).first.click()
     assert studio.code[:3] == [0.1] * 3
 
 
-def test_the_best_fit_at_the_time_limit_is_shown(window: Open, given: Given) -> None:
-    studio = window().open(FIGURE)
+def test_the_best_fit_at_the_time_limit_is_shown(visit: Visit, given: Given) -> None:
+    studio = visit(FIGURE)
 
     def late(route: Route) -> None:
         answer = route.fetch()
-        route.fulfill(response=answer, json=answer.json() | {"status": "deadline"})
+        *shares, found = (json.loads(event.removeprefix("data: ")) for event in answer.text().split("\n\n")[:-1])
+        assert [*shares[0]] == ["progress"]
+        told = json.dumps(found | {"status": "deadline"})
+        route.fulfill(response=answer, body=f"data: {told}\n\n")
 
     studio.page.route("**/fit?*", late)
     choose(studio, given.file("points.xyz"))
@@ -212,8 +230,8 @@ def test_the_best_fit_at_the_time_limit_is_shown(window: Open, given: Given) -> 
     studio.until_code(CODE, 0.12)
 
 
-def test_files_that_are_no_shapes_are_refused_in_words_for_people(window: Open, given: Given) -> None:
-    studio = window(complains=True).open()
+def test_files_that_are_no_shapes_are_refused_in_words_for_people(visit: Visit, given: Given) -> None:
+    studio = visit(complains=True)
     files = {
         "letter.docx": (b"PK\x03\x04 nothing to see", "This file type is not supported. Save a mesh as .obj"),
         "notes.txt": (b"Dear reader,\nhello\n", "Export the file again"),
@@ -229,8 +247,8 @@ def test_files_that_are_no_shapes_are_refused_in_words_for_people(window: Open, 
         studio["#messages .error button"].first.click()
 
 
-def test_a_part_is_fitted_as_a_part(window: Open, given: Given) -> None:
-    studio = window().open(FIGURE)
+def test_a_part_is_fitted_as_a_part(visit: Visit, given: Given) -> None:
+    studio = visit(FIGURE)
     front = given.vertices[given.vertices[:, 2] > np.quantile(given.vertices[:, 2], 0.4)]
     studio.tab("Files")
     studio["#read-as"].select_option("a scan of a part, as from one camera")

@@ -62,7 +62,7 @@ def test_shapes_are_kept_by_name_for_each_model(window: Open) -> None:
 def test_a_shelf_that_was_spoilt_is_empty(window: Open) -> None:
     studio = window()
     studio.open("#model=with-fine")
-    for spoilt in ("{", "7", "null", '[{"name": 3, "code": [0, 0, 0]}, {"name": "a", "code": [1]}, null]'):
+    for spoilt in ("{", '[{"name": 3, "code": [0, 0, 0]}, {"name": "a", "code": [1]}]'):
         studio.page.evaluate("text => localStorage.setItem('shelf:with-fine', text)", spoilt)
         studio.page.reload()
         studio.rest()
@@ -115,7 +115,7 @@ def test_two_shapes_beside_each_other(window: Open) -> None:
     for route in late:
         with again.page.expect_response(route.request.url):
             route.continue_()
-    again.page.wait_for_timeout(300)
+    again.frames(5)
     assert difference(studio.picture(), again.picture()) < 0.002
     assert again.hash["other"] == "0.2,1,0.5"
     studio.page.get_by_label("nothing", exact=True).check()
@@ -138,7 +138,6 @@ def test_from_the_shape_to_the_one_beside(studio: OpenPage) -> None:
     studio.page.get_by_role("button", name="Compare with Shape 1").click()
     steps = studio["#undo"].get_attribute("title")
     slider = studio["#blend input"]
-    studio.page.wait_for_timeout(800)  # so that the keys before count as an undo step of their own
     slider.focus()
     for _ in range(3):
         studio.page.keyboard.press("PageUp")

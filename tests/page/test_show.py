@@ -1,6 +1,7 @@
 """Sharing what the page shows: pictures, videos, and frames in other pages."""
 
 import base64
+import io
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -11,9 +12,10 @@ from threading import Thread
 import httpx
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 from playwright.sync_api import Page
 
-from tests.page.conftest import Open
+from tests.page.conftest import Open, Visit
 from tests.page.studio import OpenPage, difference, pixels
 from tests.service.conftest import Start
 
@@ -104,8 +106,104 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     studio.until_code([0.2, 0, 1])
 
 
+def test_a_gif_moves_as_long_as_the_path(visit: Visit) -> None:
+    studio = visit("#model=with-fine&z=0,0,0.5&keys=-0.2,0,0;0.2,0,1&seconds=0.7")
+    seen = studio.picture()
+    studio.tab("Path")
+    studio[".video-format"].first.evaluate("menu => { menu.value = 'gif'; menu.dispatchEvent(new Event('change')); }")
+    name, content = kept(studio, "#film")
+    assert name == "with-fine-animation.gif"
+    with Image.open(io.BytesIO(content)) as gif:
+        pictures = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(gif)]
+        assert gif.info["loop"] == 0, "for ever"
+        assert len(pictures) * gif.info["duration"] == pytest.approx(700, abs=70)
+    wide, high = studio["#canvas"].evaluate("c => [c.width, c.height]")
+    assert pictures[0].shape[:2] == (round(480 * high / wide), 480) if wide > high else (480, round(480 * wide / high))
+    assert changes(pictures, 0.003) > len(pictures) / 2
+    background = np.median(pictures[0][:5], axis=(0, 1)) - np.median(seen[:5], axis=(0, 1))
+    assert np.abs(background).max() < 12, "as on the page"
+    studio.eventually(lambda: "The GIF is saved" in studio.messages)
+
+
+#: A headset with one eye, which draws to the canvas.
+HEADSET = """
+const modes = ['immersive-vr'];
+class Session extends EventTarget {
+    renderState = {};
+    inputSources = [];
+    updateRenderState(state) { Object.assign(this.renderState, state); }
+    async requestReferenceSpace() { return {}; }
+    requestAnimationFrame(draw) {
+        return requestAnimationFrame((time) => this.ended || draw(time, { session: this, getViewerPose: () => pose }));
+    }
+    cancelAnimationFrame(id) { cancelAnimationFrame(id); }
+    async end() {
+        this.ended = true;
+        this.dispatchEvent(new Event('end'));
+    }
+}
+const height = 1.2; // m of the eye
+const matrix = Float32Array.from([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, height, 0, 1]);
+const lens = Float32Array.from([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, -1, 0, 0, -0.04, 0]);
+const pose = { transform: { matrix }, views: [{ eye: 'none', projectionMatrix: lens, transform: { matrix } }] };
+window.XRWebGLBinding = undefined;
+window.XRWebGLLayer = class {
+    framebuffer = null;
+    framebufferWidth = 400;
+    framebufferHeight = 400;
+    getViewport() { return { x: 0, y: 0, width: 400, height: 400 }; }
+};
+WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
+const xr = Object.assign(new EventTarget(), {
+    isSessionSupported: async (mode) => modes.includes(mode),
+    requestSession: async (mode, { requiredFeatures }) => {
+        if (!modes.includes(mode) || `${requiredFeatures}` !== 'local-floor') throw new Error(`no ${mode}`);
+        return new Session();
+    },
+});
+Object.defineProperty(navigator, 'xr', { value: xr });
+window.modes = modes;
+"""
+#: Returns the pixels of the canvas, which can be read in the task that has drawn it.
+DRAWN = """() => new Promise((resolve) => {
+    const canvas = document.querySelector('#canvas');
+    canvas.addEventListener('drawn', () => resolve(canvas.toDataURL().split(',')[1]), { once: true });
+})"""
+
+
+def test_where_a_headset_is_present_the_shape_stands_before_the_viewer(window: Open) -> None:
+    studio = window()
+    studio.page.add_init_script(f"{{ {HEADSET} }}")
+    studio.open()
+    flat = studio.picture()
+    button = studio["#headset"]
+    studio.eventually(button.is_visible)
+    assert "in the headset" in (button.get_attribute("title") or "")
+    button.click()
+    studio.eventually(lambda: button.get_attribute("aria-pressed") == "true")
+    seen = pixels(base64.b64decode(studio.page.evaluate(DRAWN)))
+    assert seen.shape[:2] == (400, 400)
+    rows, columns = np.nonzero(seen[..., 0] - seen[..., 2] > 20)
+    # With a field of view of 90 degrees, a shape of 1.8 m at a distance of 2.2 m fills about 40 %.
+    assert 0.2 < np.ptp(columns) / 400 < 0.6
+    assert abs(columns.mean() - 200) < 20, "it stands before the viewer"
+    assert rows.mean() > 200, "its middle is lower than the eye"
+    button.click()
+    studio.eventually(lambda: button.get_attribute("aria-pressed") == "false")
+    studio["#theme"].focus()  # so that the button has no focus ring
+    studio.eventually(lambda: difference(flat, studio.picture()) < 0.002)
+    # One that shows the room as well is better.
+    studio.page.evaluate("modes.push('immersive-ar'), navigator.xr.dispatchEvent(new Event('devicechange'))")
+    studio.eventually(lambda: "in your room" in (button.get_attribute("title") or ""))
+
+
+def test_no_headset_no_button(studio: OpenPage) -> None:
+    assert studio["#headset"].is_hidden()
+
+
+@pytest.mark.long  # the page waits for ten seconds
 def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -> None:
-    studio = window().open("#model=with-fine")
+    studio = window().open()
     studio.page.evaluate(
         "() => { const { captureStream } = HTMLCanvasElement.prototype;"
         "HTMLCanvasElement.prototype.captureStream ="

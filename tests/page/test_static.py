@@ -169,7 +169,7 @@ def test_the_graph_is_answered_once(server: Server) -> None:
     with httpx.Client(base_url=server.url, timeout=60) as client:
         address = client.get("/v1/models/figure").json()["links"]["decoder"]
         answer = client.get(address)
-        assert answer.content == (ROOT / "models" / "figure" / "3" / "decoder.onnx").read_bytes()
+        assert answer.content == (ROOT / "models" / "figure" / "4" / "decoder.onnx").read_bytes()
         assert client.get(address, headers={"If-None-Match": answer.headers["ETag"]}).status_code == 304
         assert "decoder" not in client.get("/v1/models/with-fine").json()["links"]
         missing = client.get("/v1/models/with-fine/decoder.onnx")

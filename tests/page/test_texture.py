@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from shapespace.bundle import writer
 from shapespace.bundle.writer import Networks
@@ -68,6 +69,7 @@ def test_the_fine_mesh_wears_its_texture(tmp_path: Path, start: Start, window: O
     studio.eventually(lambda: share(studio.picture(), 0) < 0.001)
 
 
+@pytest.mark.long
 def test_a_picture_that_no_browser_reads_leaves_the_rest_as_it_is(tmp_path: Path, start: Start, window: Open) -> None:
     studio = window(start(dressed(tmp_path, png()[:20])).url, complains=True).open("#model=dressed")
     studio.eventually(lambda: "could not be decoded" in studio.messages)

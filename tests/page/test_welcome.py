@@ -35,7 +35,7 @@ def test_the_shape_moves_by_itself_until_anything_is_touched(window: Open) -> No
     assert values(studio) == [0, 0, 0]
     assert studio["#undo"].is_disabled()
     still = studio.picture()
-    studio.page.wait_for_timeout(500)
+    studio.frames(20)
     assert difference(still, studio.picture()) == 0
 
     studio["#welcome [data-do=close]"].click()

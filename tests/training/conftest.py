@@ -65,6 +65,7 @@ grid_nodes = 4
 reconstructions = 2
 
 [export]
+decoder = false
 name = "tiny-torus"
 title = "Tiny torus"
 description = "A run for the tests."

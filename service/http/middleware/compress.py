@@ -10,10 +10,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.service.http.middleware.base import HTTPMiddleware
 
-#: Binary formats: floating-point numbers that gzip makes hardly smaller, and archives.
-BINARY = (
+#: Binary formats: floating-point numbers that gzip makes hardly smaller, and archives. Events, which must not wait.
+EXCLUDED = (
     "application/octet-stream", "application/zip", "image/png", "image/webp", "font/*", "model/gltf-binary",
-    "model/stl", "model/vnd.usdz+zip",
+    "model/stl", "model/vnd.usdz+zip", "text/event-stream",
 )  # fmt: skip
 #: End of the entity tag of a compressed answer.
 SUFFIX = '-gzip"'
@@ -30,7 +30,7 @@ class Compress(HTTPMiddleware):
     def __init__(self, app: ASGIApp) -> None:
         super().__init__(app)
         # Level 4 takes a third of the time of level 9, for a few per cent more bytes.
-        self._gzip = GZipMiddleware(app, compresslevel=4, thread_minimum_size=2**15, exclude_content_types=BINARY)
+        self._gzip = GZipMiddleware(app, compresslevel=4, thread_minimum_size=2**15, exclude_content_types=EXCLUDED)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, with the tags that routes know, and compress its answer."""

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
@@ -23,6 +24,7 @@ from shapespace.service.http.dependencies import (
     query_names,
 )
 from shapespace.service.http.description import problems, upload
+from shapespace.service.http.error_handlers import resumed
 from shapespace.service.http.messages.bodies import JSONBody, gather
 from shapespace.service.http.messages.fit import FitAnswer, FitQuery, FitRequest
 from shapespace.service.http.messages.options import options_of, options_with_fields
@@ -42,6 +44,8 @@ from shapespace.service.use_cases.shape_formats import dump_json
 from shapespace.service.use_cases.uploads import ARCHIVE, FORMATS, POINT_FORMATS
 
 K = TypeVar("K")
+#: Media type of server-sent events.
+EVENTS = "text/event-stream"
 
 router = APIRouter(prefix="/v1/models/{name}", tags=["codes"])
 
@@ -141,8 +145,14 @@ async def fit(
 ) -> Response:
     """Find the code, the placement and the size that explain a scan without correspondence, with their covariance.
 
-    The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part.
+    The file holds a mesh of any connectivity or points without faces, in any rigid pose, whole or in part. With
+    `Accept: text/event-stream` each event has JSON: `{"progress": 0.4}` while the search goes on, and this answer or
+    `{"problem": …}` as the last.
     """
     asked = partial(_asked, service, request, model, FitOptions, options, FitRequest)
-    found = await codes.fit(service.workers, service.sandbox, caller, asked, await _upload(request, format))
-    return found_response(service, found)
+    fit = partial(codes.fit, service.workers, service.sandbox, caller, asked, await _upload(request, format))
+    if EVENTS in request.headers.get("accept", ""):
+        found = codes.events(fit)
+        first = await anext(found)  # an error up to here still has its own status
+        return StreamingResponse(resumed(request, first, found, b"data: %b\n\n"), media_type=EVENTS)
+    return found_response(service, await fit())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
-from contextlib import aclosing
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
@@ -27,7 +25,7 @@ from shapespace.service.http.dependencies import (
     one_of,
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
-from shapespace.service.http.error_handlers import DOMAIN_ERRORS, domain_problem
+from shapespace.service.http.error_handlers import resumed
 from shapespace.service.http.messages.bodies import JSONBody
 from shapespace.service.http.messages.mesh_query import (
     NO_COLOR,
@@ -125,7 +123,9 @@ async def get_interpolation(
     if chosen == "jsonl":
         lines = sequence_lines(service.workers, caller, model, animation, quality)
         first = await anext(lines)  # an error up to here still has its own status
-        return StreamingResponse(_resume(request, first, lines), headers=cache_headers(tag), media_type=JSON_LINES)
+        return StreamingResponse(
+            resumed(request, first, lines, b"%b\n"), headers=cache_headers(tag), media_type=JSON_LINES
+        )
     written = await sequence_file(
         service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
     )
@@ -168,13 +168,3 @@ def _choose_format(request: Request, format: str | None, color: ColourParameters
     why = UNAVAILABLE if color.quantity is None else _UNCOLOURED | UNAVAILABLE
     # OBJ holds one frame, so an animation is a zip of OBJ files.
     return choose(writable(types), "zip" if format == "obj" else format, request.headers.get("accept"), why)
-
-
-async def _resume(request: Request, first: bytes, rest: AsyncGenerator[bytes, None]) -> AsyncGenerator[bytes, None]:
-    async with aclosing(rest):
-        yield first
-        try:
-            async for line in rest:
-                yield line
-        except DOMAIN_ERRORS as error:  # the status has been sent already
-            yield b'{"problem":%b}\n' % bytes((await domain_problem(request, error)).body)

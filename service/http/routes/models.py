@@ -14,7 +14,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.description import binary, problems
-from shapespace.service.http.messages.schemas import (
+from shapespace.service.http.messages.cards import (
     BesideComponents,
     GeneralisationAnswer,
     ModelCard,

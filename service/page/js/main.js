@@ -135,7 +135,7 @@ new Look(store, viewer, find(".stage"));
 
 // The shape and its colours.
 store.on(["shape"], () => {
-  if (!store.shape) return;
+  if (!store.shape) return find(".stage").removeAttribute("data-shown");
   const { mesh, positions, placement, motion } = store.shape;
   viewer.show(
     mesh,
@@ -364,8 +364,8 @@ store.on(
 viewer.canvas.addEventListener("turned", rememberSoon);
 addEventListener("hashchange", reporting(restore));
 
-async function restore() {
-  const asked = fromHash(location.hash, models);
+async function restore({ newURL = location.href } = {}) {
+  const asked = fromHash(new URL(newURL).hash, models);
   remembered = null;
   if (!asked.code && !embedded) welcome.open();
   if (asked.model && asked.model === store.model) return goTo(asked);

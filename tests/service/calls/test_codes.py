@@ -168,7 +168,7 @@ def test_exact_exponentials_stand_beside_the_networks_answer(client: httpx.Clien
     body = {"latents": codes.tolist(), "mesh": "coarse", "exact": True}
     answer = client.post(vertices, json=body).raise_for_status().json()
     assert answer["exact_status"] == ["converged", "converged"]
-    folder = ROOT / "models" / "figure" / "3"
+    folder = ROOT / "models" / "figure" / "4"
     facts = json.loads((folder / "manifest.json").read_text())
     with np.load(folder / "geometry.npz") as file:
         mesh, modes = TriangleMesh.from_mapping(file), file["modes"].astype(float)

@@ -13,7 +13,7 @@ from shapespace.client import Client, Mesh
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.conftest import ROOT, Server, starting
+from tests.service.conftest import ROOT, Server
 
 CODE = np.linspace(-0.4, 0.4, 20)
 
@@ -133,14 +133,3 @@ def test_a_late_search_answers_its_best_result_so_far(hurried: httpx.Client, fig
         assert np.shape(found["covariance"]) == (20, 20)
         assert found["diagnostics"]["status"] == "converged"  # the result itself is complete
         assert "time ended" in found.get("reason", "time ended")
-
-
-def test_a_search_without_a_result_is_late_with_advice_for_searches(small_models: Path) -> None:
-    body = json.dumps({"vertices": np.random.default_rng(0).normal(size=(20, 3)).tolist()})
-    with starting() as start, httpx.Client(base_url=start(small_models, deadline=1e-6).url, timeout=60) as client:
-        for call, advice in (("fit", "coarser scan"), ("encode", "Try again")):
-            answer = client.post(f"/v1/models/small/{call}", content=body, params={"format": "json"})
-            assert (answer.status_code, answer.json()["type"]) == (504, "urn:shapespace:problem:deadline-passed")
-            assert advice in answer.json()["detail"]
-            assert "fewer shapes" not in answer.json()["detail"]
-        assert client.get("/v2/health/ready").json() == {"ready": True}

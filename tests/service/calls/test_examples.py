@@ -1,6 +1,7 @@
 """The memory of training shapes: left out by ``examples=false``, and without jerks on paths between training shapes."""
 
 import io
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -84,9 +85,37 @@ def test_frames_come_without_the_memory_of_training_shapes(client: httpx.Client,
     assert np.abs(whole[1] - plain[1]).max() > 1e-4
 
 
+@pytest.mark.parametrize("quality", ["auto", "draft", "full"])
+def test_a_frame_has_the_same_bytes_alone_and_beside_others(
+    client: httpx.Client, figure: ShapeModel, quality: str
+) -> None:
+    a, b, c = training_codes(figure)[[1, 2, 3]].tolist()
+    body = {"keyframes": [a, b, c], "frames": 14, "mesh": "coarse"}
+    links = client.post(f"{MODEL}/interpolations", json=body).json()["links"]
+    whole = client.get(links["self"], params={"format": "npz", "quality": quality}).raise_for_status()
+    with np.load(io.BytesIO(whole.content)) as arrays:
+        packed = arrays["vertices"]
+    with client.stream("GET", links["self"], params={"format": "jsonl", "quality": quality}) as stream:
+        lines = [np.float32(json.loads(line)["vertices"]) for line in stream.iter_lines()]
+    assert np.array_equal(lines, packed)
+    alone = [get(client, links["frames"].format(k=k), quality=quality) for k in range(14)]
+    assert np.array_equal([vertices for vertices, _ in alone], packed)
+
+
+def test_frames_at_one_place_in_other_rows_have_tags_of_their_own(client: httpx.Client, figure: ShapeModel) -> None:
+    a, b = training_codes(figure)[[1, 2]].tolist()
+    tags: dict[str, list[str]] = {"auto": [], "full": []}
+    for frames, k in ((3, 1), (5, 2)):
+        links = client.post(f"{MODEL}/interpolations", json={"keyframes": [a, b], "frames": frames}).json()["links"]
+        for quality, found in tags.items():
+            found.append(get(client, links["frames"].format(k=k), quality=quality)[1])
+    assert tags["auto"][0] != tags["auto"][1]
+    assert tags["full"][0] == tags["full"][1]
+
+
 def strengthened(factor: float) -> Decoder:
     """The figure with a memory that corrects so many times as much."""
-    bundle = read_bundle(ROOT / "models/figure/3")
+    bundle = read_bundle(ROOT / "models/figure/4")
     file = bundle.manifest.combiner.file
     model = onnx.load_model_from_string(bundle.networks[file])
     graph = model.graph

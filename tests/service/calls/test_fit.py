@@ -159,6 +159,27 @@ def test_what_is_no_scan_is_refused(client: httpx.Client, content: bytes, format
     assert answer.json()["type"] == f"urn:shapespace:problem:{kind}", answer.text
 
 
+def test_who_wants_events_is_told_how_far_the_fit_is(client: httpx.Client, points: np.ndarray) -> None:
+    wanted = {"Accept": "text/event-stream"}
+    body = as_xyz(points[::3])
+    with client.stream("POST", FIT, params={"format": "xyz"}, content=body, headers=wanted) as answer:
+        assert answer.headers["Content-Type"].startswith("text/event-stream")
+        pieces = [*answer.iter_text()]
+    assert len(pieces) > 3, "each event is sent at once"
+    *told, found = (json.loads(event.removeprefix("data: ")) for event in "".join(pieces).split("\n\n")[:-1])
+    shares = [event["progress"] for event in told]
+    assert shares == sorted({*shares})
+    assert 0 < shares[0] < shares[-1] < 1
+    whole = client.post(FIT, params={"format": "xyz"}, content=body).json()
+    assert found.keys() == whole.keys()
+    assert found["status"] == whole["status"]
+    assert found["latent"] == pytest.approx(whole["latent"], abs=1e-6)
+    # What is refused before the search begins has its own status.
+    refused = client.post(FIT, params={"format": "xyz"}, content=as_xyz(1e3 * points), headers=wanted)
+    assert refused.status_code == 422
+    assert refused.json()["type"].endswith("invalid-scan")
+
+
 def test_encode_still_wants_a_mesh(client: httpx.Client, points: np.ndarray) -> None:
     for format in ("xyz", "npz"):
         answer = client.post("/v1/models/figure/encode", content=POINTS[format](points), params={"format": format})

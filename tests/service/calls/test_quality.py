@@ -46,6 +46,7 @@ def exact(model: ShapeModel, code: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [25, pytest.param(1000, marks=pytest.mark.long)])
 def test_auto_is_at_most_a_tenth_further_from_exact_shapes_than_full(model: ShapeModel, count: int) -> None:
+    """On average; for single codes too, where all drafts are improved."""
     away: dict[str, list[float]] = {"full": [], "auto": []}
     for code in model.sample(count, seed=1):
         true = exact(model, code)
@@ -53,8 +54,10 @@ def test_auto_is_at_most_a_tenth_further_from_exact_shapes_than_full(model: Shap
             found = model.decode(code, "coarse", quality=Quality(quality))
             distances.append(float(np.linalg.norm(align(found, true) - true, axis=1).mean()))
     full, auto = np.array([*away.values()])
-    assert auto.mean() <= 1.02 * full.mean()
-    assert np.quantile(auto / full, 0.95) <= 1.1
+    assert model.decoder.auto is not None
+    some_drafts = model.decoder.auto.draft_misfit > 0
+    assert auto.mean() <= (1.1 if some_drafts else 1.02) * full.mean()
+    assert np.quantile(auto / full, 0.95) <= (1.7 if some_drafts else 1.1)
 
 
 def test_auto_takes_fewer_steps_than_full(model: ShapeModel) -> None:
@@ -64,6 +67,16 @@ def test_auto_takes_fewer_steps_than_full(model: ShapeModel) -> None:
         for quality in (Quality.AUTO, Quality.FULL)
     )
     assert 2 * auto < full
+
+
+def test_drafts_are_answered_where_they_are_good_for_half_of_the_codes_at_least(model: ShapeModel) -> None:
+    found = [model.shape(code).diagnostics for code in model.sample(40)]
+    drafts = [each for each in found if not each.iterations]
+    assert model.decoder.auto is not None
+    good = model.decoder.auto.draft_misfit
+    assert all(each.residual <= good for each in drafts)
+    assert (len(drafts) > 14) == (good > 0) == (model.manifest.name == "freaky-torus")
+    assert all(each.quality == "auto" for each in found)
 
 
 def test_a_model_without_a_measured_tolerance_answers_full(model: ShapeModel) -> None:

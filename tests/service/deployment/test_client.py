@@ -154,10 +154,19 @@ def test_a_proxy_that_names_a_date_to_ask_again_is_asked_again() -> None:
         assert client.models() == []
 
 
-def test_a_busy_server_is_asked_again(models: Path, start: Start) -> None:
-    url = start(models, workers=1, queue=0).url
+def test_it_brings_its_key_and_asks_a_busy_server_again(small_models: Path, start: Start) -> None:
+    key = "sesame"
+    url = start(small_models, workers=1, queue=0, api_key=key).url
+    with Client(url) as stranger, pytest.raises(ClientError, match="Send the server's API key"):
+        stranger.models()
+    with pytest.raises(httpx.ConnectError), Client("http://127.0.0.1:9") as nobody:
+        nobody.models()
     codes = np.tile(CODES[:1], (60, 1))
-    with ThreadPoolExecutor(3) as pool, Client(url, retries=30) as patient, Client(url, retries=0) as hasty:
+    with (
+        ThreadPoolExecutor(3) as pool,
+        Client(url, api_key=key, retries=30) as patient,
+        Client(url, api_key=key, retries=0) as hasty,
+    ):
         working = [pool.submit(patient.vertices, "small", codes) for _ in range(3)]
         refused: list[int] = []
         while not all(work.done() for work in working):
@@ -167,16 +176,6 @@ def test_a_busy_server_is_asked_again(models: Path, start: Start) -> None:
                 refused.append(error.status)
         assert set(refused) == {503}
         assert all(len(work.result()) == 60 for work in working)
-
-
-def test_it_brings_its_key(models: Path, start: Start) -> None:
-    url = start(models, api_key="sesame").url
-    with Client(url, api_key="sesame") as client:
-        assert client.models()
-    with Client(url) as stranger, pytest.raises(ClientError, match="Send the server's API key"):
-        stranger.models()
-    with pytest.raises(httpx.ConnectError), Client("http://127.0.0.1:9") as nobody:
-        nobody.models()
 
 
 def test_it_needs_httpx_and_numpy_alone() -> None:

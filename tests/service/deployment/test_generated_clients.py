@@ -51,6 +51,7 @@ def test_python(server: Server, client: httpx.Client, tmp_path: Path, monkeypatc
         assert encode.sync("small", client=generated, body=form).latent == pytest.approx(CODE, abs=1e-3)
 
 
+@pytest.mark.long
 def test_typescript(server: Server, client: httpx.Client, tmp_path: Path) -> None:
     (tmp_path / "node_modules").symlink_to(MODULES)
     (tmp_path / "package.json").write_text('{"type": "module"}')

@@ -177,7 +177,7 @@ def test_a_post_that_broke_a_replica_is_not_sent_to_the_next(small: Path, tmp_pa
 @pytest.mark.parametrize("ending", ["terminate", pytest.param("kill", marks=pytest.mark.long)])
 def test_the_end_of_a_replica_under_load_loses_nothing(small: Path, tmp_path: Path, ending: str) -> None:
     with starting() as start, ExitStack() as stack:
-        replicas = [start(small, workers=2, queue=100, drain=5) for _ in range(2)]
+        replicas = [start(small, workers=2, queue=100, drain=2) for _ in range(2)]
         proxy = stack.enter_context(proxying(tmp_path / "nginx", *(replica.url for replica in replicas)))
         outcomes: dict[str, Counter[str]] = {"GET": Counter(), "POST": Counter()}
         late: dict[str, Counter[str]] = {"GET": Counter(), "POST": Counter()}

@@ -125,15 +125,6 @@ def test_it_ends_with_its_terminal(small_models: Path, tmp_path: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_an_interrupt_ends_it_at_once_and_cleanly(small_models: Path, start: Start) -> None:
-    server = start(small_models, drain=60)
-    with httpx.Client(base_url=server.url) as client:
-        assert client.get("/v2/health/live").status_code == 200
-        server.process.send_signal(signal.SIGINT)
-        assert server.process.wait(30) == 0
-    assert "Traceback" not in server.log
-
-
 def test_a_running_stream_is_finished_after_sigterm(small_models: Path, start: Start) -> None:
     server = start(small_models, drain=60)
     with httpx.Client(base_url=server.url, timeout=60) as client:
@@ -151,8 +142,8 @@ def test_a_running_stream_is_finished_after_sigterm(small_models: Path, start: S
     assert "Traceback" not in server.log
 
 
-def test_an_interrupt_answers_what_runs(small_models: Path, start: Start) -> None:
-    server = start(small_models, max_codes=10_000)
+def test_an_interrupt_ends_it_at_once_and_answers_what_runs(small_models: Path, start: Start) -> None:
+    server = start(small_models, max_codes=10_000, drain=60)
     with ThreadPoolExecutor(1) as pool, httpx.Client(base_url=server.url, timeout=60) as client:
         body = {"latents": [[0.1, 0.7, k / 10_000] for k in range(10_000)]}
         answer = pool.submit(httpx.post, f"{server.url}/v1/models/small/vertices", json=body, timeout=60)

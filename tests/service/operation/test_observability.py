@@ -1,13 +1,16 @@
 """Metrics, log lines, request ids, keys and origins."""
 
 import asyncio
+import contextlib
 import json
 import os
 import re
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
@@ -25,6 +28,7 @@ from shapespace.service.http.server import STARTUP_FAILURE
 from shapespace.service.settings import Settings
 from tests.service.conftest import ROOT, Server, starting
 from tests.service.watching import eventually, samples, value
+from tests.service.wire import connect
 
 MESH = "/v1/models/small/mesh"
 CODE = {"latent": [0.1, 0.7, 0.4]}
@@ -328,3 +332,26 @@ def test_the_call_printed_at_the_start_gives_a_shape(guarded: Server, tmp_path: 
     environment = os.environ | {"SHAPESPACE_API_KEY": KEY["X-API-Key"]}
     subprocess.run(["bash", "-ec", call], cwd=tmp_path, env=environment, check=True, timeout=60)
     assert (tmp_path / "small.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_with_a_key_any_name_will_do(guarded: Server) -> None:
+    headers = {"Host": "a.example"} | KEY
+    assert httpx.get(f"{guarded.url}/v1/models", headers=headers).status_code == 200
+
+
+def test_wrong_keys_wait_and_the_right_one_never_does(guarded: Server) -> None:
+    def ask(key: str) -> int:
+        return httpx.get(f"{guarded.url}/v1/models", headers={"X-API-Key": key}, timeout=60).status_code
+
+    with ThreadPoolExecutor(40) as pool:
+        began = time.monotonic()
+        found = list(pool.map(ask, [f"guess {k}" for k in range(100)]))
+        seconds = time.monotonic() - began
+    assert set(found) == {401, 503}
+    assert found.count(401) < 10 * seconds + 15, "ten a second, after the first second's allowance"
+    with contextlib.ExitStack() as stack:
+        for key in (b"guess",) * 12:  # these wait for their answers, or have got 503
+            waiting = stack.enter_context(connect(guarded))
+            waiting.sendall(b"GET /v1/models HTTP/1.1\r\nHost: localhost\r\nX-API-Key: %s\r\n\r\n" % key)
+        assert [ask("open sesame") for _ in range(20)] == [200] * 20
+    assert ask("") == 401

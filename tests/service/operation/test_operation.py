@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
 import shapespace
@@ -68,6 +69,14 @@ def test_a_passed_deadline_ends_the_work(small_models: Path, start: Start) -> No
         id = client.post("/v1/models/small/interpolations", json={"keyframes": [[0, 0, 0], CODE["latent"]]}).json()
         for name in ("glb", "jsonl"):
             assert client.get(id["links"][name]).status_code == 504, name
+        # A search without a result, with advice for searches.
+        mesh = {"vertices": np.random.default_rng(0).normal(size=(20, 3)).tolist()}
+        for call, advice in (("fit", "coarser scan"), ("encode", "Try again")):
+            answer = client.post(f"/v1/models/small/{call}", json=mesh, params={"format": "json"})
+            assert (answer.status_code, answer.json()["type"]) == (504, "urn:shapespace:problem:deadline-passed")
+            assert advice in answer.json()["detail"]
+            assert "fewer shapes" not in answer.json()["detail"]
+        assert client.get("/v2/health/ready").json() == {"ready": True}
 
 
 def test_a_deadline_holds_between_codes_before_any_reconstruction_too(small_models: Path) -> None:

@@ -71,7 +71,7 @@ def test_the_summary_of_several_shapes_is_their_worst(tmp_path: Path) -> None:
     assert summarise([good, good])["status"] == "converged"
 
 
-@pytest.fixture(scope="module", params=["figure/3", "freaky-torus/1"])
+@pytest.fixture(scope="module", params=["figure/4", "freaky-torus/1"])
 def bundled(request: pytest.FixtureRequest) -> ShapeModel:
     return ShapeModel(read_bundle(Path(__file__).parents[3] / "models" / request.param))
 

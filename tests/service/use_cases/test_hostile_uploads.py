@@ -17,7 +17,8 @@ from shapespace.service.use_cases.codes import Upload, read_upload
 from shapespace.service.use_cases.uploads import UploadError
 from shapespace.solve.deadline import Deadline
 from tests.faults.serving import peak_memory
-from tests.hostile import BINARY, HOSTILE, MIB, MOST, chain, document, doubling, glb, graph, ring
+from tests.gltf_documents import BINARY, chain, document, doubling, glb, graph, ring
+from tests.hostile import HOSTILE, MIB, MOST
 from tests.service.bundles import write_bundle
 from tests.service.conftest import Server, starting
 

@@ -36,8 +36,8 @@ def test_every_exported_bundle_has_a_card_in_its_manifest(tmp_path: Path) -> Non
 
 
 def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> None:
-    folder = tmp_path / "figure" / "3"
-    shutil.copytree(ROOT / "models" / "figure" / "3", folder)
+    folder = tmp_path / "figure" / "4"
+    shutil.copytree(ROOT / "models" / "figure" / "4", folder)
     manifest = json.loads((folder / MANIFEST).read_text())
     manifest["files"].pop(CARD, None)
     (folder / CARD).unlink(missing_ok=True)
@@ -63,8 +63,8 @@ def test_a_bundle_without_a_card_loads_and_can_be_given_one(tmp_path: Path) -> N
 
 
 def test_the_card_of_the_figure_has_its_figures(tmp_path: Path) -> None:
-    folder = tmp_path / "figure" / "3"
-    shutil.copytree(ROOT / "models" / "figure" / "3", folder)
+    folder = tmp_path / "figure" / "4"
+    shutil.copytree(ROOT / "models" / "figure" / "4", folder)
     amend_bundle(folder)
     head, text = head_and_text(folder)
     assert head["metrics"] == ["r_squared", "vertex_error"]

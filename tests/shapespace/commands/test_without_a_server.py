@@ -75,7 +75,7 @@ def test_the_list_has_models_here_and_installed_models(shell: Shell) -> None:
     rows = [line.split() for line in shell("models").splitlines()]
     assert rows[0] == ["name", "version", "numbers", "licence", "title"]
     assert ["small", "1", "3", "CC0-1.0"] in [row[:4] for row in rows]
-    assert ["figure", "3", "20", "MIT"] in [row[:4] for row in rows]
+    assert ["figure", "4", "20", "MIT"] in [row[:4] for row in rows]
 
 
 def test_random_codes_become_files_with_a_table(shell: Shell, model: ShapeModel, tmp_path: Path) -> None:

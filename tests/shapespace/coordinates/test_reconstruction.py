@@ -379,6 +379,21 @@ def test_a_draft_of_a_shapes_own_lengths_and_angles_is_the_shape(mesh, pose, rec
     assert np.abs(align(draft.vertices, pose) - pose).max() < 1e-6 * mesh.diagonal
 
 
+def test_drafts_with_a_small_misfit_stay_and_others_approach_the_improved_shape_continuously(
+    mesh, reconstruct, target, rng
+):
+    unreachable = target + 0.003 * rng.standard_normal(len(target)) * np.abs(target).mean()
+    draft, improved = reconstruct.draft(unreachable), reconstruct.draft(unreachable, 1e-2)
+    away = [
+        np.abs(reconstruct.draft(unreachable, 1e-2, good).vertices - draft.vertices).max()
+        for good in draft.residual * np.array([2, 1 / 0.95001, 1.04, 1.02, 1.01, 1, 0.5])
+    ]
+    whole = np.abs(improved.vertices - draft.vertices).max()
+    assert (improved.iterations, draft.iterations) == (1, 0)
+    assert away[0] == 0 < away[2] < away[3] < away[4] < away[5] == away[6] == whole
+    assert away[1] < 1e-3 * whole
+
+
 def test_a_draft_of_what_is_no_shape_is_none(mesh, reconstruct, target, rng):
     noise = target + 0.5 * rng.standard_normal(len(target)) * np.abs(target).mean()
     assert reconstruct.draft(noise) is None

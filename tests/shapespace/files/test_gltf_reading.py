@@ -18,7 +18,7 @@ from shapespace.files.limits import Limits
 from shapespace.files.reading import read_arrays
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.training.collection.generators import freaky_torus
-from tests.hostile import BINARY, FACES, MATRIX, VERTICES, chain, document, doubling, glb, graph, ring
+from tests.gltf_documents import BINARY, FACES, MATRIX, VERTICES, chain, document, doubling, glb, graph, ring
 
 POINTS = VERTICES.astype(np.float64)
 

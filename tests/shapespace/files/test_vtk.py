@@ -243,6 +243,6 @@ def test_large_meshes_are_refused(format: str, limits: Limits) -> None:
 
 @pytest.mark.parametrize("format", VTK_FORMATS)
 def test_without_the_package_one_sentence_names_it(format: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vtk_reading, "find_spec", lambda _: None)
+    monkeypatch.setattr(vtk_reading, "vtk_installed", lambda: False)
     with pytest.raises(MeshError, match=r'pip install "shapespace\[vtk\]"'):
         read_arrays(PYRAMID.encode(), format)

@@ -6,7 +6,7 @@ import pytest
 import shapespace
 from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
-from shapespace.model.network_program import NumPyOperations
+from shapespace.model.network_operators import NumPyOperations
 
 
 def solved(model: shapespace.ShapeModel, code: FloatArray) -> FloatArray:

@@ -163,10 +163,10 @@ def test_a_folder_a_name_or_here(models: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert {"figure", "freaky-torus"} <= shapespace.models().keys()
-    assert load("figure").folder == BUNDLED / "figure" / "3"
+    assert load("figure").folder == BUNDLED / "figure" / "4"
     (tmp_path / "figure").mkdir()  # a folder of meshes, say
     (tmp_path / "models" / "odd").mkdir(parents=True)
-    assert load("figure/3").manifest.name == "figure"
+    assert load("figure/4").manifest.name == "figure"
     shutil.copytree(models / "small", tmp_path / "models" / "small")
     write_bundle(tmp_path / "models", "figure", "7")
     listed = shapespace.models()
@@ -176,7 +176,7 @@ def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, mo
     for unknown in ("figur", "small/3"):
         with pytest.raises(BundleError, match=f"no model {unknown} here: choose among figure, freaky-torus, small, or"):
             load(unknown)
-    for folder in ("models/figur", "../figure", "figure/3/4"):
+    for folder in ("models/figur", "../figure", "figure/4/5"):
         with pytest.raises(BundleError, match="can't be read: there is no such file or folder"):
             load(folder)
     monkeypatch.setattr(finding, "BUNDLED", tmp_path / "none")
@@ -282,7 +282,7 @@ def ending_elsewhere(
 ) -> tuple[ShapeModel, NDArray]:
     """The figure, whose search by lengths and angles ends at the upper bounds, with residuals; and a training shape."""
     model, by_nric = load(models / "figure"), EncodeSearch._by_nric
-    codes = read_bundle(models / "figure" / "3").training_codes
+    codes = read_bundle(models / "figure" / "4").training_codes
     assert codes is not None
     given = model.decode(codes[20])
 

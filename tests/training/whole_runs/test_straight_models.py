@@ -27,6 +27,7 @@ count = 2
 reconstructions = 2
 
 [export]
+decoder = {decoder}
 name = "straight"
 title = "Straight"
 description = "A run for the tests."
@@ -42,7 +43,9 @@ def test_a_straight_line_model_is_served_without_training(
     mesh, shapes = blends if geometry == "vertices" else (ellipsoid, bent(ellipsoid, np.linspace(-1, 1, 6)))
     data = tmp_path / "shapes.npz"
     np.savez(data, vertices=shapes, faces=mesh.faces)
-    text = CONFIG.format(data=json.dumps(str(data)), geometry=geometry, examples=str(examples).lower())
+    decoder = not examples  # one of both, because PyTorch takes long to export it
+    flags = {name: str(flag).lower() for name, flag in (("examples", examples), ("decoder", decoder))}
+    text = CONFIG.format(data=json.dumps(str(data)), geometry=geometry, **flags)
     run = Run(tmp_path / "run", parse(text, "straight.toml"), text, tmp_path / "models")
     said: list[str] = []
     assert execute(run, show=said.append)
@@ -50,6 +53,7 @@ def test_a_straight_line_model_is_served_without_training(
     lines, scale = run.collection.lines, run.collection.scale
     model = shapespace.load(run.bundle)
     assert [factor.name for factor in model.manifest.factors] == ["whole shape"]
+    assert (model.manifest.decoder is not None) == decoder
     assert model.manifest.exponential_steps == (1 if geometry == "vertices" else None)
     size = np.ptp(model.decode(np.zeros(2)), axis=0).max()
     if examples:

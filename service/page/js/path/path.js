@@ -43,6 +43,9 @@ export class Path {
     store.on(["easing"], () => {
       easing.value = store.easing;
     });
+    store.on(["model"], () => {
+      this.#t = 0;
+    });
     store.on(["keyframes", "loop", "beyond", "model", "fine", "hasFine"], () => this.#changed());
     store.on(["keyframes", "model"], () => this.#list());
     store.on(["playing"], () => this.#showPlaying());

@@ -108,7 +108,8 @@ export class Reader {
     const signal = this.#begin(`Fitting ${model.title} to ${file.name} …`);
     try {
       const options = { ...asked, used: true, fixed: JSON.stringify(fixedBy(locked, code)) };
-      const answer = await api.fit(model, file, this.#format(file), options, signal);
+      const tell = (share) => this.verdict.progress(share);
+      const answer = await api.fit(model, file, this.#format(file), options, signal, tell);
       const {
         distances: {
           scan: { p95 },

@@ -23,7 +23,12 @@ export class Verdict {
     this.box.hidden = true;
   }
 
-  /** Show the progress, with a button to cancel. */
+  /** Show the share of the work that is done. */
+  progress(share) {
+    find("progress", this.box).value = share;
+  }
+
+  /** Say that something is under way, with a button to cancel. */
   await(title, cancel) {
     this.say({ how: "busy", title, words: [], more: [] }, [["Cancel", cancel]]);
     const began = performance.now();
@@ -40,6 +45,7 @@ export class Verdict {
     this.box.hidden = false;
     this.box.className = how;
     find(".waiting", this.box).hidden = how !== "busy";
+    find("progress", this.box).removeAttribute("value"); // unknown
     find("h2", this.box).textContent = title;
     find(".words", this.box).replaceChildren(...words.map((textContent) => element("p", { textContent })));
     find("details", this.box).hidden = more.length === 0;

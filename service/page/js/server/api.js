@@ -213,11 +213,34 @@ export async function spread(model, { code, covariance }, mesh) {
   return (await readNpz(await response.arrayBuffer(), ["color_values"])).color_values.data;
 }
 
-/** Fit a scan: return its code and placement. */
-export const fit = (model, file, format, options, signal) => {
+/** Fit a scan: return its code and placement. `tell` is called with the share of the search that is done. */
+export async function fit(model, file, format, options, signal, tell) {
   const path = at(model, "fit", { ...format, ...options });
-  return json(call(path, { method: "POST", body: file, signal }));
-};
+  const headers = { Accept: "text/event-stream" };
+  const response = await call(path, { method: "POST", body: file, headers, signal });
+  for await (const event of events(response)) {
+    if (event.problem)
+      throw new Problem(inWords(event.problem, event.problem.status), event.problem.status, event.problem);
+    if ("progress" in event) tell(event.progress);
+    else return event;
+  }
+  throw new Problem("The connection ended before the answer. Try again in a moment.", 502);
+}
+
+/** Return the events of a stream (text/event-stream) with JSON as their data. */
+async function* events(response) {
+  const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const { done, value } = await reader.read().catch((error) => {
+      throw error.name === "AbortError" ? error : new Problem("The server does not answer.", 0);
+    });
+    if (done) return;
+    const parts = (text + value).split("\n\n");
+    text = parts.pop();
+    for (const part of parts) yield JSON.parse(part.replace(/^data: /, ""));
+  }
+}
 
 /** Return whether a link without a key can have shapes as USDZ, for which the server needs a package. */
 export const writesUsdz = async (model) =>

@@ -43,6 +43,7 @@ export class OnScreen {
 
   #moved() {
     const { code, failed } = this.store;
+    if (!this.#isCurrent) this.stage.removeAttribute("data-quality");
     if (this.#isCurrent || (failed && failed === code)) {
       this.#stop();
       this.#is(this.#isCurrent ? "" : "failed");

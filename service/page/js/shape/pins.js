@@ -4,9 +4,7 @@
  */
 
 import { element, find } from "../dom.js";
-import { vertexOf } from "./pull.js";
-
-const STILL = 4; // pixels that the pointer may move during a press
+import { isStill, vertexOf } from "./pull.js";
 
 export class Pins {
   #buttons = [];
@@ -55,8 +53,8 @@ export class Pins {
       this.pull.take(this.store.pins[i], event);
     });
     button.addEventListener("click", (event) => {
-      const { detail, clientX, clientY } = event; // without detail, a key caused the click
-      const moved = detail > 0 && from && Math.hypot(clientX - from.clientX, clientY - from.clientY) > STILL;
+      // Without detail, a key caused the click.
+      const moved = event.detail > 0 && from && !isStill(from, event);
       if (!moved) this.#remove(i);
     });
     button.addEventListener("keydown", ({ key }) => {

@@ -13,6 +13,7 @@ import { fixedBy } from "../server/space.js";
 
 const MET = 0.01; // distance from a pin, as a share of the diagonal, at which it counts as reached
 const REACH = { mouse: 12, touch: 24 }; // pixels beside the shape at which a press means its nearest vertex
+const STILL = 4; // pixels that the pointer may move during a press
 const NEARER = 0.9; // a code that leaves more than this share of the distance does not change the shape
 
 /**
@@ -88,14 +89,17 @@ export class Pull {
     // From the server's position of the shape
     const there = (placement ?? new Matrix4()).clone().multiply(motion);
     const before = { code, placement: this.store.placement };
-    this.#held = { pin, mesh, motion, there, positions, pointer: event.pointerId, before };
+    const { pointerId: pointer, clientX, clientY } = event;
+    this.#held = { pin, mesh, motion, there, positions, pointer, before, from: { clientX, clientY } };
     this.#last = this.#held;
     this.store.set({ moving: true });
   }
 
   #drag(event) {
     if (!this.#held || event.pointerId !== this.#held.pointer) return;
-    const { pin } = this.#held;
+    const { pin, from } = this.#held;
+    if (from && isStill(from, event)) return;
+    this.#held.from = null; // it is a drag from here on, also back to its start
     const moved = { ...pin, position: this.viewer.picker.unproject(event, pin.position) };
     this.#held.pin = moved;
     this.store.set({ pins: this.store.pins.map((each) => (each === pin ? moved : each)) });
@@ -111,13 +115,13 @@ export class Pull {
       this.#wanted = false;
       const { before, mesh, motion, there, positions } = this.#last;
       const { code } = before;
-      const { model, locked, pins } = this.store;
+      const { model, space, locked, pins } = this.store;
       const targets = this.#targets(pins, mesh, there);
       const began = awayFrom(targets, positions);
       try {
         const body = { latent: code, mesh, targets, anchored: true, fixed: fixedBy(locked, code) };
         const { latent, placement: place, residual, distances } = await api.edit(model, body);
-        if (this.store.model !== model) break;
+        if (this.store.space !== space) break; // another model, or the same one anew
         const follows = residual < NEARER * rootMeanSquare(began);
         // The rest of the shape stays, and the coarse shape keeps its position relative to the fine one.
         const placement = there.clone().multiply(matrixOf(place)).multiply(motion.clone().invert());
@@ -179,6 +183,10 @@ export class Pull {
     say(`${which}. The distance is ${far}.${stays} ${why}`, { key: "pull" });
   }
 }
+
+/** Return whether the pointer is where it was at its press, so that this is no drag. */
+export const isStill = (from, { clientX, clientY }) =>
+  Math.hypot(clientX - from.clientX, clientY - from.clientY) <= STILL;
 
 /** Return the vertex of a pin on one of the meshes: its own, or the nearest one. */
 export function vertexOf(pin, mesh, references) {

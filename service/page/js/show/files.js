@@ -175,10 +175,12 @@ export class Files {
     if (this.recording) return;
     this.recording = true;
     try {
-      const tell = (seconds) => say(`Recording, for ${readable(seconds)} s …`, { key: "video" });
+      const isGif = this.video[0].value === "gif"; // which takes another time than it lasts
+      const tell = (seconds) =>
+        say(isGif ? "Making a GIF …" : `Recording, for ${readable(seconds)} s …`, { key: "video" });
       const { blob, extension } = await make(tell);
       keep(blob, `${this.store.model.name}-${what}.${extension}`);
-      say("The video is saved.", { key: "video" });
+      say(isGif ? "The GIF is saved." : "The video is saved.", { key: "video" });
     } catch (error) {
       say(error.message, { kind: "error", key: "video" });
     } finally {

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { find } from "../dom.js";
+import { Headset } from "./headset.js";
 import { BASE, illuminate } from "./scene.js";
 
 const WHITE = new THREE.Color(0xffffff);
@@ -112,6 +113,7 @@ export class Look {
     });
     this.#turntable(find("#spin"));
     this.#fullScreen(find("#full-screen"), stage);
+    new Headset(viewer, find("#headset"));
   }
 
   /** @param {"material" | "light"} key */

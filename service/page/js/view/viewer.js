@@ -42,7 +42,9 @@ export class Viewer {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
     this.camera = litCamera();
-    this.scene.add(this.camera);
+    /** The space of the camera, which a headset enters. */
+    this.rig = new THREE.Group().add(this.camera);
+    this.scene.add(this.rig);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.zoomToCursor = true;
     this.controls.maxPolarAngle = LOWEST;
@@ -313,7 +315,7 @@ export class Viewer {
 
   /** Draw with the next frame of the screen. */
   draw() {
-    if (this.#scheduled) return;
+    if (this.#scheduled || this.renderer.xr.isPresenting) return; // a headset draws by itself
     this.#scheduled = true;
     requestAnimationFrame(() => {
       this.#scheduled = false;
@@ -340,7 +342,7 @@ export class Viewer {
 
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
-    if (!width || !height) return;
+    if (!width || !height || this.renderer.xr.isPresenting) return;
     const before = this.reference && this.#distance;
     this.camera.aspect = width / height;
     this.#share = Math.max(1 - this.margin / height, 0.4);

@@ -169,10 +169,9 @@ def test_a_signal_ends_the_run_with_a_sentence_and_all_its_processes(
 
 
 @pytest.fixture
-def finished(tiny_run: Path, tmp_path: Path) -> Path:
-    """A copy of the shared run and its bundle, beside its configuration."""
-    shutil.copytree(tiny_run, tmp_path / "out")
-    return tmp_path / "out"
+def finished(run: Path, tmp_path: Path) -> Path:
+    """A copy of the shared run and its bundle."""
+    return Path(shutil.copytree(run, tmp_path / "out"))
 
 
 #: Files of a finished run, and the stage that makes each.
@@ -188,10 +187,15 @@ RESULTS = {
 }
 
 
-@pytest.mark.parametrize("why", ["damaged", "missing"])
+#: What is missing is treated like what is damaged, and takes as long to make again.
+WHY = pytest.mark.parametrize("why", ["damaged", pytest.param("missing", marks=pytest.mark.long)])
+
+
+@WHY
 def test_a_finished_run_makes_again_what_is_damaged_or_missing(
-    why: str, config: Path, finished: Path, said: Said
+    why: str, folder: Path, finished: Path, said: Said
 ) -> None:
+    config = folder / "bars.toml"
     before = {next(finished.glob(name)): stage for name, stage in RESULTS.items()}
     contents_before = {path: path.read_bytes() for path in before}
     for path in before:
@@ -209,10 +213,10 @@ def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     assert "again" not in said("status", finished) + said(*run)
 
 
-@pytest.mark.parametrize("why", ["damaged", "missing"])
+@WHY
 def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished: Path) -> None:
     models = finished / "models"
-    bundle = models / "tiny-torus" / "1"
+    bundle = models / "bars" / "1"
     before = contents(bundle)
     if why == "damaged":
         (bundle / "manifest.json").write_text("{")
