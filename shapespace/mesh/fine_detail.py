@@ -1,8 +1,8 @@
 """What weights of neighbouring coarse vertices cannot carry to the fine mesh, learned from the collection's shapes.
 
-Where the shapes of a collection differ by millimetres, the fine detail of a place follows the whole shape more than its
-surroundings: a bone that is wider here has a deeper groove there. Ridge regression of this detail on the principal
-coordinates of the coarse shape, and principal fields of the result, keep the part that returns on unseen shapes.
+Where shapes differ little, the fine detail of a place follows the whole shape, not only its surroundings. A bone that
+is wider here may have a deeper groove there. Ridge regression of this detail on the principal coordinates of the
+coarse shape, and principal fields of the result, keep the part that returns on unseen shapes.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
         STAGES[name].run(run)
     found = run.collection
     assert found.steps == steps
-    code = 0.7 * found.upper
+    code = 0.3 * found.upper
     straight = found.reference.vertices + np.tensordot(code, found.modes, axes=1)
     away = np.abs(align(found.shapes(code[None]).vertices[0], straight) - straight).max()
     assert away < 1e-12 if steps == 1 else away > 1e-4
