@@ -27,6 +27,7 @@ NO_MATHEMATICS = {
     "shapespace.model.correspondence",
     "shapespace.model.encode_faults",
     "shapespace.model.fit_constraints",
+    "shapespace.model.fit_preparation",
     "shapespace.model.fit_result",
     "shapespace.model.fit_settings",
     "shapespace.model.inputs",
