@@ -43,12 +43,14 @@ from shapespace.training.stages.stage import Run
 SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 16}
 #: Run with the most modes that 110 shapes allow; the paper's bodies have as many modes and factors.
 LARGEST = "hippocampus-80"
+#: The paper's largest experiment, on bodies of the built-in generator of this name.
+EXPRESSIVE = "expressive"
 #: Collections of real meshes, in the order of the tables. Contrasts are the hand without sparse modes, with one factor
-#: and with the variants of the paper's outlook, the dancer from few samples, the largest run, and runs with the paper's
-#: modes.
+#: and with the variants of the paper's outlook, the dancer from few samples, the largest runs, and runs with the
+#: paper's modes.
 COLLECTIONS = ("hand", "faces", "samba", "makehuman", "horse", "hippocampus")
 CONTRASTS = (
-    *("hand-pga", "hand-one-factor", "hand-outlook", "samba-few", LARGEST),
+    *("hand-pga", "hand-one-factor", "hand-outlook", "samba-few", LARGEST, EXPRESSIVE),
     *(name + SHELL for name in COLLECTIONS),
 )
 #: The bundled collection of shapes; its other figures are on the page of the bundled models.
@@ -78,12 +80,12 @@ def have(run: RunDirectory, name: str, measure: Callable[[], dict[str, Any]]) ->
 
 
 def open_run(name: str, data: Path, out: Path) -> Run:
-    """Return the run of a collection or of the figure; mirror images are used only if the name ends in ``MIRRORED``.
+    """Return the run of a collection or of a generator; mirror images are used only if the name ends in ``MIRRORED``.
 
     A name that ends in ``SHELL`` gets the paper's modes, without the paper's system and the grid.
     """
     plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
-    path = ROOT / "examples" / (f"{plain}.toml" if plain == MANNEQUIN else f"collections/{plain}.toml")
+    path = ROOT / "examples" / (f"{plain}.toml" if plain in (MANNEQUIN, EXPRESSIVE) else f"collections/{plain}.toml")
     meshes = load(path)[0].collection.data
     _, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
     document: Any = tomlkit.parse(text)
@@ -91,6 +93,7 @@ def open_run(name: str, data: Path, out: Path) -> Run:
     if name.endswith(SHELL):
         document["modes"].update(SHELL_MODES)
         document.pop("networks", None)
+    if name.endswith(SHELL) or name == EXPRESSIVE:
         document["evaluation"] = {"baselines": True}
     text = tomlkit.dumps(document)
     return Run(out / name, parse(text, name), text, out / "models")
@@ -296,6 +299,7 @@ def write_page() -> None:
         real=real,
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         largest=rows.get(LARGEST),
+        expressive=rows.get(EXPRESSIVE),
         missing=[name for name in COLLECTIONS if name not in rows],
         missing_shell=[name for name in COLLECTIONS if name + SHELL not in rows],
         spread=spread,
