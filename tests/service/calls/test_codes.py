@@ -22,8 +22,11 @@ CODE = [0.1, 0.7, 0.4]
 LOWER, UPPER = np.array([-0.2, -np.pi, 0]), np.array([0.2, np.pi, 1])
 
 
-def positions(client: httpx.Client, code: Any, model: str = "with-fine", mesh: str = "fine") -> np.ndarray:
-    answer = client.post(f"/v1/models/{model}/vertices", json={"latents": [np.asarray(code).tolist()], "mesh": mesh})
+def positions(
+    client: httpx.Client, code: Any, model: str = "with-fine", mesh: str = "fine", quality: str = "auto"
+) -> np.ndarray:
+    body = {"latents": [np.asarray(code).tolist()], "mesh": mesh, "quality": quality}
+    answer = client.post(f"/v1/models/{model}/vertices", json=body)
     return np.array(answer.raise_for_status().json()["vertices"][0])
 
 
@@ -50,11 +53,10 @@ def test_an_edit_reaches_what_can_be_reached(client: httpx.Client, name: str, se
     rng = np.random.default_rng(seed)
     vertices = rng.choice(len(shape), 4, replace=False).tolist()
     found = edit(client, shape[vertices], vertices, f"/v1/models/{name}/edit", latent=start)
-    reached = placed(found, positions(client, found["latent"], name))
+    reached = placed(found, positions(client, found["latent"], name, quality="full"))  # as the edit's last shape
     diagonal = np.linalg.norm(np.ptp(shape, axis=0))
     distances = np.linalg.norm(reached[vertices] - shape[vertices], axis=1)
     assert distances.max() < 0.01 * diagonal
-    # An edit ends with a full shape, and quality `auto` differs a little from it.
     np.testing.assert_allclose(found["distances"], distances, atol=5e-5)
     assert found["residual"] == pytest.approx(np.sqrt((distances**2).mean()), abs=5e-5)
     card = client.get(f"/v1/models/{name}").json()
