@@ -100,9 +100,9 @@ class _Fit:
         fixed = self.options.fixed
         self.starts = self.prepared.shapes_of(self.prepared.codes(fixed)) if fixed else self.prepared.starts
         self.remembered = None if fixed else self.prepared.remembered
-        self._reach(BEGUN)
         if not self.constraints.free:
             self._require_units()
+        self._reach(BEGUN)  # a scan that is refused has told nothing
         with self.decoder.solver() as reconstruct:
             rough, middle, full = (
                 self._search(reconstruct, self.scan, self.constraints, accuracy) for accuracy in (ROUGH, MIDDLE, SOLVED)

@@ -13,6 +13,7 @@ from shapespace.bundle import writer
 from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.bundle.schema import ARRAYS, MANIFEST, SURFACE, Manifest
 from shapespace.bundle.writer import Networks
+from shapespace.mesh.fine_detail import FineDetail
 from shapespace.mesh.prolongation import Prolongation, RigidPart
 from tests.service.bundles import facts, fine_reference, geometry, reference, seal, write_bundle
 
@@ -24,7 +25,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     written = replace(geometry(fine=True), file_vertices=np.array([-1, *range(512)]))
     part = np.array([3, 5, 8, 300])
-    prolong = replace(written.fine.prolong, rigid=(RigidPart(part, written.fine.reference.vertices[part]),))
+    rest = written.reference.vertices
+    fields = np.full((1, len(written.fine.reference.vertices), 3), 0.5, np.float32)
+    detail = FineDetail(rest, np.ones((1, *rest.shape), np.float32), fields)
+    parts = (RigidPart(part, written.fine.reference.vertices[part]),)
+    prolong = replace(written.fine.prolong, rigid=parts, detail=detail)
     written = replace(written, fine=replace(written.fine, prolong=prolong))
     networks = Networks(factors=[b"0", b"1"], combiner=b"2", start=b"3")
     folder = writer.write_bundle(tmp_path, facts(), networks, written)

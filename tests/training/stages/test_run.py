@@ -12,9 +12,9 @@ from shapespace.training.stages.run import STAGES, execute, stage_keys
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY
 
+HERE, RUNS = Path(__file__).parent, Path(__file__).parents[3] / "runs"
 #: Stamps that version 0.2 gave to the stages of these runs.
-STAMPS = json.loads(Path(__file__).with_name("stamps_of_0_2.json").read_text())
-RUNS = Path(__file__).parents[3] / "runs"
+STAMPS = json.loads((HERE / "stamps_of_0_2.json").read_text())
 
 
 @pytest.mark.parametrize("name", STAMPS)
@@ -22,7 +22,7 @@ def test_no_stage_of_a_run_of_version_0_2_is_done_again(name: str, tmp_path: Pat
     directory, said = RunDirectory(tmp_path), list[str]()
     for stage, stamp in STAMPS[name].items():
         directory.stamp(stage).write(stamp)
-    stored = RUNS / name / "config.toml"
+    stored = next(path for path in (HERE / f"{name}_of_0_2.toml", RUNS / name / "config.toml") if path.is_file())
     run = Run(tmp_path, *load(stored, stored=stored), tmp_path / "models")
     assert not execute(run, "evaluation", show=said.append)  # there is no bundle
     assert said[0].startswith("networks.seeds")

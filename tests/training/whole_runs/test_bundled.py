@@ -25,7 +25,7 @@ from tests.training.conftest import Said
 
 ROOT = Path(__file__).parents[3]
 #: Versions of the bundled models.
-MODELS = {"freaky-torus": "1", "figure": "3"}
+MODELS = {"freaky-torus": "1", "figure": "4"}
 
 #: What a run of version 0.1 left of the torus.
 RUN_OF_0_1 = Path(__file__).parent / "run_of_0_1"
@@ -58,7 +58,7 @@ def test_an_example_is_the_recipe_of_the_committed_run(name: str) -> None:
         for path in (ROOT / "examples" / f"{name}.toml", ROOT / "runs" / name / "config.toml")
     )
     listed = Studies.listed(name)
-    assert committed["networks"].pop("seeds") == listed.seeds
+    assert committed.get("networks", {}).pop("seeds", []) == listed.seeds
     assert committed.pop("variants", {}) == {k: v.model_dump(exclude_unset=True) for k, v in listed.variants.items()}
     assert example["evaluation"].pop("baselines")  # runs of 0.2 trained them without being asked
     assert today(name, example) == today(name, committed)
@@ -85,7 +85,7 @@ def test_committed_runs_can_be_looked_at(folder: Path, tmp_path: Path, said: Sai
 
 
 def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> None:
-    """R² of the committed ONNX files; the affine sum of the factors alone has a lower one."""
+    """R² of the committed ONNX files; the error of the affine sum of the factors alone is much larger."""
     model = shapespace.load(ROOT / "models" / "figure")
     codes, reference = model.sample(16, seed=20261123), model.reference
     answers = model.decode(codes, mesh="coarse").astype(np.float32)
@@ -101,7 +101,7 @@ def test_the_figures_networks_follow_exponentials_that_nobody_drew_before() -> N
     norm = WeightedNorm.of(reference, 1e-2)
     scores = {name: r_squared(z, exact, norm) for name, z in {"networks": predicted, "affine": affine}.items()}
     assert min(scores["networks"].values()) > 0.999
-    assert scores["affine"]["total"] < 0.995
+    assert 1 - scores["networks"]["total"] < (1 - scores["affine"]["total"]) / 3
 
 
 def test_the_torus_networks_know_shape_and_bump_at_fresh_codes() -> None:
