@@ -50,7 +50,9 @@ def between(overlaps: FloatArray, groups: Sequence[Sequence[int]]) -> FloatArray
 def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
     """Form factors by repeatedly joining the two groups with the largest average overlap (average linkage).
 
-    With a ``count``, J, joining ends when ``count`` groups are left. Without it, two groups are joined if they have
+    With a ``count``, J, joining ends when ``count`` groups are left. As long as other groups can be joined, no group
+    gets more than twice the mean number of modes: otherwise one factor may take nearly all modes of a face, too many to
+    learn. Without ``count``, two groups are joined if they have
     together at most `LARGEST_FACTOR` modes and overlap more than two modes do on average, since the usual overlap
     depends on the collection: its median is 0.4 on a captured body in loose clothes, where nearly everything moves a
     little with everything else, and 0.1 on a hand. The algorithm is written out because a dendrogram has no limit on
@@ -64,15 +66,17 @@ def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
         raise FactorError(f"the number of factors must be from 1 to the number of modes, {m}, not {count}")
     pairs = overlaps[np.triu_indices(m, 1)]
     threshold = min(HIGHEST_THRESHOLD, float(pairs.mean())) if len(pairs) else HIGHEST_THRESHOLD
+    most = LARGEST_FACTOR if count is None else 2 * -(-m // count)
     groups = [[j] for j in range(m)]
     while len(groups) > (count or 1):
         shared = between(overlaps, groups)
         np.fill_diagonal(shared, -np.inf)
-        if count is None:
-            sizes = np.array([len(g) for g in groups])
-            shared[np.add.outer(sizes, sizes) > LARGEST_FACTOR] = -np.inf
-            if shared.max() <= threshold:
-                break
+        sizes = np.array([len(g) for g in groups])
+        limited = np.where(np.add.outer(sizes, sizes) > most, -np.inf, shared)
+        if count is None and limited.max() <= threshold:
+            break
+        if np.isfinite(limited.max()):
+            shared = limited
         a, b = sorted(divmod(int(shared.argmax()), len(groups)))
         groups[a] = sorted(groups[a] + groups.pop(b))
     return sorted(groups)

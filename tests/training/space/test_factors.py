@@ -74,6 +74,15 @@ def test_one_factor_or_one_for_each_mode(modes, norm):
     assert group(np.ones((3, 3))) == [[0, 1, 2]]
 
 
+def test_no_factor_takes_nearly_all_modes_of_a_face():
+    """Modes of a face overlap with one another and with nothing else."""
+    shared = np.eye(16)
+    shared[:13, :13] = 0.5 + 0.5 * np.eye(13)
+    sizes = [len(modes) for modes in group(shared, 4)]
+    assert len(sizes) == 4
+    assert max(sizes) <= 2 * 16 / 4
+
+
 @pytest.mark.parametrize("count", [0, 8, -1])
 def test_other_counts_are_refused(modes, norm, count):
     with pytest.raises(FactorError, match=f"from 1 to the number of modes, 7, not {count}"):
