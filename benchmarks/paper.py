@@ -37,34 +37,38 @@ from shapespace.training.stages.stage import Run
 ROUNDING = 1e-6
 
 
-#: The paper's system with factor networks that validation codes of the bump chose (NOTES.md, The paper's own system).
-#: Its combiner has the paper's order of layers and the sizes of `PAPER`; other sizes have not been tried.
-CHOSEN = Recipe(
-    factors=LatentNetworkSettings(
-        hidden=[512, 512, 512],
-        normalisation="none",
-        skip_degree=0,
-        energy=1,
-        fit=FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=150),
-    ),
-    combiner=CombinerSettings(correction=PaperSettings(normalisation="after"), symmetries=False),
+#: Perceptrons that validation codes of the bump chose (NOTES.md, The paper's own system). The loss has the norm of R².
+PERCEPTRON = LatentNetworkSettings(
+    hidden=[512, 512, 512],
+    normalisation="none",
+    skip_degree=0,
+    energy=1,
+    eta=1e-2,
+    fit=FitSettings(schedule="cosine", learning_rate=1e-3, max_epochs=300),
 )
-#: Recipes by their names in ``evaluation.json``.
-SYSTEMS = {"paper": PAPER, "paper_chosen": CHOSEN}
+#: The paper's system with sizes chosen here.
+CHOSEN = Recipe(
+    factors=PERCEPTRON,
+    combiner=CombinerSettings(correction=PaperSettings(normalisation="after"), symmetries=False, eta=1e-2),
+)
+#: Composites, or networks of the whole code, by their names in ``evaluation.json``.
+Systems = Mapping[str, Recipe | LatentNetworkSettings]
+AS_GUESSED: Systems = {"paper": PAPER}
+AS_CHOSEN: Systems = {"paper_chosen": CHOSEN, "monolithic_chosen": PERCEPTRON}
 
 
 class OtherSamplesError(ValueError):
     """The samples differ from the samples of the stored figures."""
 
 
-def measure(run: Run, evaluation: dict[str, Any], systems: Mapping[str, Recipe]) -> None:
+def measure(run: Run, evaluation: dict[str, Any], systems: Systems) -> None:
     """Train systems on the samples of a run, and add their figures to an ``evaluation.json`` of the same run.
 
     Args:
         run: run of a generator; new, or with samples and networks of an earlier call.
         evaluation: figures of its other models, changed in place. ``NAME_factors`` receives R² of the factor networks
             of a system.
-        systems: recipes by name.
+        systems: settings by name.
 
     Raises:
         OtherSamplesError: kernel ridge regression, which has a closed form, has another R² than before.
@@ -81,15 +85,17 @@ def measure(run: Run, evaluation: dict[str, Any], systems: Mapping[str, Recipe])
     for now, where in zip(reached(learner.kernel()), (evaluation, fresh), strict=True):
         if abs(now["total"] - (before := where["r2"]["kernel"]["total"])) > ROUNDING:
             raise OtherSamplesError(f"{run.directory.folder}: the kernel has {now['total']}, and had {before}")
-    for system, recipe in systems.items():
-        model = learner.composite(recipe)
+    for system, settings in systems.items():
+        composite = learner.composite(settings) if isinstance(settings, Recipe) else None
+        model = composite or learner.joint_network("monolithic-paper", settings)
         evaluation["r2"][system], fresh["r2"][system] = reached(model)
         evaluation["sizes"][system] = size_bytes(model)
-        own = predict(model.factor_shapes, latents).numpy()
-        evaluation[f"{system}_factors"] = {
-            name: r_squared(own[:, j], collection.shapes(alone(codes, index)).nric, test.norm)
-            for j, (name, index) in enumerate(collection.factors.items())
-        }
+        if composite:
+            own = predict(composite.factor_shapes, latents).numpy()
+            evaluation[f"{system}_factors"] = {
+                name: r_squared(own[:, j], collection.shapes(alone(codes, index)).nric, test.norm)
+                for j, (name, index) in enumerate(collection.factors.items())
+            }
 
 
 def main() -> None:
@@ -99,7 +105,7 @@ def main() -> None:
     parser.add_argument("--chosen", action="store_true", help="with the sizes chosen here, beside the earlier figures")
     parser.add_argument("names", nargs="+", help="folders of runs/")
     given = parser.parse_args()
-    system = "paper_chosen" if given.chosen else "paper"
+    systems = AS_CHOSEN if given.chosen else AS_GUESSED
     for name in given.names:
         record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
         evaluation = json.loads((file if given.chosen and file.exists() else record / "evaluation.json").read_text())
@@ -107,7 +113,7 @@ def main() -> None:
         measure(
             Run(given.out / name, *load(config, stored=config), given.out / "models"),
             evaluation,
-            {system: SYSTEMS[system]},
+            systems,
         )
         write_figures(file, evaluation)
 
