@@ -24,9 +24,9 @@ from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.network_settings import (
     CombinerSettings,
+    ConvolutionSettings,
     FitSettings,
     LatentNetworkSettings,
-    PaperSettings,
     Recipe,
 )
 from shapespace.training.stages.networks import learner_of
@@ -38,18 +38,31 @@ ROUNDING = 1e-6
 
 
 #: Perceptrons that validation codes of the bump chose (NOTES.md, The paper's own system). The loss has the norm of R².
+#: The last layer has principal axes of the training shapes as its basis, so that an epoch takes a tenth of the time.
 PERCEPTRON = LatentNetworkSettings(
-    hidden=[512, 512, 512],
+    hidden=[512, 512, 512, 512],
     normalisation="none",
     skip_degree=0,
-    energy=1,
+    energy=0.9999,
     eta=1e-2,
-    fit=FitSettings(schedule="cosine", learning_rate=1e-3, max_epochs=300),
+    fit=FitSettings(schedule="cosine", learning_rate=1e-3, max_epochs=200),
 )
-#: The paper's system with sizes chosen here.
+#: The paper's system with sizes chosen here. Its combiner learns the difference from the affine sum, which the paper
+#: does not say. NOTES.md compares.
 CHOSEN = Recipe(
     factors=PERCEPTRON,
-    combiner=CombinerSettings(correction=PaperSettings(normalisation="after"), symmetries=False, eta=1e-2),
+    combiner=CombinerSettings(
+        correction=ConvolutionSettings(
+            layers=3,
+            width=48,
+            edge_channels=0,
+            dropout=0.1,
+            normalisation="after",
+            fit=FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=2, max_epochs=7),
+        ),
+        symmetries=False,
+        eta=1e-2,
+    ),
 )
 #: Composites, or networks of the whole code, by their names in ``evaluation.json``.
 Systems = Mapping[str, Recipe | LatentNetworkSettings]
