@@ -17,9 +17,10 @@ import numpy as np
 import torch
 
 from benchmarks.pages import ROOT, write_figures
+from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
 from shapespace.training.learning.learner import PAPER
-from shapespace.training.learning.networks import predict
+from shapespace.training.learning.networks import FactorNetwork, predict
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.network_settings import (
@@ -99,12 +100,15 @@ def measure(run: Run, evaluation: dict[str, Any], systems: Systems) -> None:
         if abs(now["total"] - (before := where["r2"]["kernel"]["total"])) > ROUNDING:
             raise OtherSamplesError(f"{run.directory.folder}: the kernel has {now['total']}, and had {before}")
     for system, settings in systems.items():
-        composite = learner.composite(settings) if isinstance(settings, Recipe) else None
-        model = composite or learner.joint_network("monolithic-paper", settings)
+        model: Composite | FactorNetwork
+        if isinstance(settings, Recipe):
+            model = learner.composite(settings)
+        else:
+            model = learner.joint_network("monolithic-paper", settings)
         evaluation["r2"][system], fresh["r2"][system] = reached(model)
         evaluation["sizes"][system] = size_bytes(model)
-        if composite:
-            own = predict(composite.factor_shapes, latents).numpy()
+        if isinstance(model, Composite):
+            own = predict(model.factor_shapes, latents).numpy()
             evaluation[f"{system}_factors"] = {
                 name: r_squared(own[:, j], collection.shapes(alone(codes, index)).nric, test.norm)
                 for j, (name, index) in enumerate(collection.factors.items())
