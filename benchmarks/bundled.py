@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import pages, served, studies
 from benchmarks.pages import ROOT
-from benchmarks.paper import SYSTEMS
+from benchmarks.paper import AS_CHOSEN, AS_GUESSED
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators import freaky_torus
 from shapespace.training.learning.evaluation import r_squared
@@ -28,6 +28,7 @@ MODELS = {
     "paper": "the paper's own system",
     "paper_chosen": "the paper's own system, sizes chosen here",
     "monolithic_paper": "the paper's monolithic network",
+    "monolithic_chosen": "the paper's monolithic network, sizes chosen here",
     "affine": "affine sum, exact factors",
     "affine of learned factors": "affine sum, learned factors",
     "grid": "multilinear grid of each factor",
@@ -51,11 +52,11 @@ def add_paper(found: dict[str, Any], again: dict[str, Any]) -> None:
     """
     if found["fresh"]["sha256"] != again["fresh"]["sha256"] or found["r2"]["composite"] != again["r2"]["composite"]:
         raise ValueError("the paper's own system was measured beside other networks")
-    for system in SYSTEMS.keys() & again["r2"].keys():
+    for system in (AS_GUESSED.keys() | AS_CHOSEN.keys()) & again["r2"].keys():
         for old, new in ((found, again), (found["fresh"], again["fresh"])):
             old["r2"][system] = new["r2"][system]
         found["sizes"][system] = again["sizes"][system]
-    found["paper_factors"] = again.get("paper_factors")
+    found |= {name: again[name] for name in ("paper_factors", "paper_chosen_factors") if name in again}
 
 
 def without_bump(count: int = 1000) -> float:

@@ -4,6 +4,7 @@
 """
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +48,13 @@ def models(run: Run, studio: Studio, path: Path) -> None:
         "the paper's monolithic": predict(learner.monolithic_paper(), latents).numpy(),
         "affine sum of factors": affine_sum(rest, predict(composite.factor_shapes, latents).numpy()),
     }
-    reconstruct = Reconstructor(reference, eta)
+    compared(found, exact, studio, Reconstructor(reference, eta), path)
+
+
+def compared(
+    found: Mapping[str, NDArray], exact: FloatArray, studio: Studio, reconstruct: Reconstructor, path: Path
+) -> None:
+    """Draw exact shapes (n, V, 3), and shapes of NRIC (n, 2E) by the models' names with colours for the distance."""
     made = {
         name: align(np.stack([reconstruct(row, tolerance=1e-6).vertices for row in z]), exact)
         for name, z in found.items()
@@ -56,7 +63,7 @@ def models(run: Run, studio: Studio, path: Path) -> None:
     studio = replace(studio, camera=studio.camera.framing(points, MARGIN))
     columns: list[tuple[str, list[NDArray[np.uint8]]]] = [("exact", [studio.pixels(x, SIZE, CLAY) for x in exact])]
     for name, shapes in made.items():
-        away = np.linalg.norm(shapes - exact, axis=2) / reference.diagonal
+        away = np.linalg.norm(shapes - exact, axis=2) / reconstruct.reference.diagonal
         level = np.log(np.maximum(away, LEAST) / LEAST) / np.log(MOST / LEAST)
         pictures = [studio.pixels(x, SIZE, tint(ERROR, row)) for x, row in zip(shapes, level, strict=True)]
         columns.append((f"{name}\nmean {100 * away.mean():.3f} %", pictures))

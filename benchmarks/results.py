@@ -300,6 +300,7 @@ def write_page() -> None:
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         largest=rows.get(LARGEST),
         expressive=rows.get(EXPRESSIVE),
+        torus=pages.read_figures(ROOT / "runs" / "freaky-torus-1000-paper" / "evaluation.json"),
         missing=[name for name in COLLECTIONS if name not in rows],
         missing_shell=[name for name in COLLECTIONS if name + SHELL not in rows],
         spread=spread,

@@ -2,7 +2,7 @@
 
 Networks put out NRIC ``z`` (n, 2E) and compute in *scaled differences*: ``(z − z̄)`` times the square roots of the
 weights of ``‖·‖_{2,z̄}``. Lengths and angles are each divided by their own standard deviation, so that the mean square
-over entries is the loss with both halves normalised.
+over entries is the loss with both halves normalised. With a given weight η of angles, one number divides both.
 """
 
 from __future__ import annotations
@@ -73,12 +73,16 @@ class Scaling(nn.Module):
         return cls(np.zeros(size), np.zeros(size))
 
     @classmethod
-    def of(cls, reference: FloatArray, weights: FloatArray, samples: NDArray) -> Scaling:
-        """Scale samples (n, 2E) to unit mean square about their mean, in each half; weights (2E,) at η = 1."""
-        root, half = np.sqrt(weights), len(weights) // 2
+    def of(cls, reference: FloatArray, weights: FloatArray, samples: NDArray, eta: float | None = None) -> Scaling:
+        """Scale samples (n, 2E) to unit mean square about their mean, as a whole in the norm with a given η.
+
+        Without η, each half has unit mean square. ``weights`` (2E,) are of the norm with η = 1.
+        """
+        half = len(weights) // 2
+        root = np.sqrt(weights * np.repeat([1.0, eta or 1.0], half))
         spread = (samples - samples.mean(axis=0)) * root
         factor = root.copy()
-        for part in (slice(0, half), slice(half, None)):
+        for part in (slice(0, half), slice(half, None)) if eta is None else (slice(None),):
             factor[part] /= max(float(np.sqrt(np.mean(spread[:, part] ** 2))), 1e-12)
         return cls(reference, factor)
 

@@ -103,8 +103,8 @@ class Learner:
         text = json.dumps([*decides, [s.model_dump(mode="json") for s in settings]])
         return self.run.network(f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:12]}")
 
-    def _scaling(self, z: NDArray) -> Scaling:
-        return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z)
+    def _scaling(self, z: NDArray, eta: float | None = None) -> Scaling:
+        return Scaling.of(self._reference, WeightedNorm.of(self.collection.reference, eta=1.0).squared, z, eta)
 
     @property
     def rows(self) -> dict[str, IntArray]:
@@ -166,7 +166,7 @@ class Learner:
         drawn, rows = samples()
         data = TrainingData(torch.as_tensor(drawn.latents[:, index], dtype=torch.float32), drawn.nric, rows)
         z = drawn.nric[rows["train"]]
-        scaling, basis = self._scaling(z), None
+        scaling, basis = self._scaling(z, settings.eta), None
         if settings.energy < 1:
             y, midpoints = scaling.down(torch.from_numpy(z)).numpy(), self.collection.reference.edge_midpoints
             basis = PatchBasis.fit(y, midpoints, settings.patches, settings.energy, self.seed, settings.support)
@@ -253,7 +253,7 @@ class Learner:
         data = TrainingData(predict(partial(factor_shapes, networks, indices), latents), self.joint.nric, self.rows)
         if settings.symmetries:
             data = self._with_images(data)
-        scaling = self._scaling(self.joint.nric[self.rows["train"]])
+        scaling = self._scaling(self.joint.nric[self.rows["train"]], settings.eta)
         slopes = self._slopes(indices, networks, data.inputs, scaling)
         own = JointSamples(*data.part("train"), scaling, indices, slopes, self._motion("train"))
         held_out = JointSamples(*data.part("validation"), scaling, indices, motion=self._motion("validation"))
@@ -338,7 +338,7 @@ class Learner:
 
     def monolithic(self) -> Composite:
         """Return our recipe with one factor of all latents, fitted to the joint samples."""
-        network = self._joint_network("monolithic", self.config.monolithic)
+        network = self.joint_network("monolithic", self.config.monolithic)
         index, combiner = list(range(len(self.collection.coordinates))), self.config.networks.combiner
         decides = [self.config.monolithic, *choices(combiner.correction)]
         path = self._path("monolithic-combiner", [self.share], combiner, *decides)
@@ -346,9 +346,10 @@ class Learner:
 
     def monolithic_paper(self) -> FactorNetwork:
         """Return Φ̃, the paper's fully connected baseline."""
-        return self._joint_network("monolithic-paper", self.config.monolithic_paper)
+        return self.joint_network("monolithic-paper", self.config.monolithic_paper)
 
-    def _joint_network(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
+    def joint_network(self, kind: str, settings: LatentNetworkSettings) -> FactorNetwork:
+        """Return one network for the whole code, fitted to the joint samples."""
         index = list(range(len(self.collection.coordinates)))
         path = self._path(kind, [self.share], settings)
         return self._latent_network(settings, index, path, self.share, lambda: (self.joint, self.rows))

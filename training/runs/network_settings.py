@@ -48,7 +48,7 @@ class LatentNetworkSettings(SettingsTable):
     The baseline ``monolithic`` is this network with one factor. ``monolithic_paper`` is the paper's monolithic network.
     """
 
-    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation"})
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "eta"})
 
     hidden: list[int] = Field([128, 128])
     """Width of each hidden layer."""
@@ -72,6 +72,9 @@ class LatentNetworkSettings(SettingsTable):
     integrability: float = Field(0, ge=0)
     """Weight, in gradient descent, of lengths and angles that fit no surface. They leave a gap between the first and
     the last face around a vertex. The gap is linearised at the mean and scaled to the mean square error."""
+    eta: float | None = Field(None, gt=0)
+    """Weight of angles in the loss, as ``evaluation.eta`` is their weight in R². By default the loss scales lengths and
+    angles to the same variance."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
     """How the network is trained."""
 
@@ -260,10 +263,14 @@ _COMBINER_OF_0_1 = {
 class CombinerSettings(SettingsTable):
     """The map from J factor shapes to the joint shape: their affine sum, plus a correction."""
 
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"eta"})
+
     correction: CorrectionSettings = AutoSettings()
     """How the difference between the joint shape and the affine sum is learned."""
     symmetries: bool = True
     """Whether the training samples include their images under the collection's symmetries, if it has any."""
+    eta: float | None = Field(None, gt=0)
+    """Weight of angles in the loss, as in the factor networks."""
 
     @model_validator(mode="before")
     @classmethod

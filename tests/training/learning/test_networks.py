@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from shapespace.coordinates.integrability import Integrability
-from shapespace.coordinates.nric import NRICJacobian, nric
+from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.learning.baselines import LatentKernel
 from shapespace.training.learning.latent_features import FourierProducts, LatentFeatures, Polynomials, affordable_degree
@@ -83,6 +83,15 @@ def test_scaled_differences_go_both_ways_and_have_unit_size(sheet: TriangleMesh)
     inner = np.concatenate([np.ones(half, bool), sheet.connectivity.interior])
     np.testing.assert_allclose(network.up(y)[:, inner], z[:, inner], atol=1e-5)
     assert np.all(network.up(y + 1)[:, ~inner].numpy() == 0), "a boundary edge has no angle"
+
+
+def test_scaled_differences_are_in_a_given_norm(sheet: TriangleMesh) -> None:
+    z, norm = noisy(sheet, 50), WeightedNorm.of(sheet, 0.03)
+    rest, weights = nric(sheet.vertices, sheet.connectivity), WeightedNorm.of(sheet, 1.0).squared
+    y = Scaling.of(rest, weights, z, eta=0.03).down(torch.from_numpy(z).float()).double().numpy()
+    assert np.square(y - y.mean(axis=0)).mean() == pytest.approx(1, rel=1e-4)
+    sizes, wanted = (y**2).sum(axis=1), (z - rest) ** 2 @ norm.squared
+    np.testing.assert_allclose(sizes / sizes[0], wanted / wanted[0], rtol=1e-4)
 
 
 @pytest.mark.parametrize("patches", [1, 5])

@@ -5,6 +5,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -17,7 +18,13 @@ from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.runs.network_settings import FitSettings, ProductSettings, Recipe
+from shapespace.training.runs.network_settings import (
+    CombinerSettings,
+    DenseSettings,
+    FitSettings,
+    ProductSettings,
+    Recipe,
+)
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY
@@ -70,18 +77,22 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
 
 def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run) -> None:
     """The main networks, in the place of the paper's that take hours, reach again what they have reached."""
-    before, systems = copy.directory.evaluation.read(), dict.fromkeys(paper.SYSTEMS, copy.config.networks)
+    before = copy.directory.evaluation.read()
+    same = {"paper": "composite", "paper_chosen": "composite", "monolithic_chosen": "monolithic_paper"}
+    assert same.keys() == {*paper.AS_GUESSED, *paper.AS_CHOSEN}
+    settings = {"composite": copy.config.networks, "monolithic_paper": copy.config.monolithic_paper}
     after = deepcopy(before)
-    paper.measure(copy, after, systems)
+    paper.measure(copy, after, {system: settings[model] for system, model in same.items()})
     for old, new in ((before, after), (before["fresh"], after["fresh"])):
-        for system in systems:
-            assert new["r2"][system] == pytest.approx(old["r2"]["composite"], abs=1e-6)
+        for system, model in same.items():
+            assert new["r2"][system] == pytest.approx(old["r2"][model], abs=1e-6)
     bundled.add_paper(before, after)
-    assert before["fresh"]["r2"]["paper"] == after["fresh"]["r2"]["paper"]
+    for system in same:
+        assert before["fresh"]["r2"][system] == after["fresh"]["r2"][system]
 
     before["fresh"]["seed"] += 1
     with pytest.raises(paper.OtherSamplesError, match="the kernel has"):
-        paper.measure(copy, before, systems)
+        paper.measure(copy, before, {})
 
 
 def r2(learner: Learner, model: Model, part: str) -> float:
@@ -134,6 +145,19 @@ def test_all_networks_are_tuned_together_once(copy: Run, monkeypatch: pytest.Mon
     again = learner_of(copy).composite(tuned)
     with torch.no_grad():
         assert torch.equal(first(codes), again(codes))
+
+
+def test_networks_learn_in_the_norm_of_their_settings(copy: Run) -> None:
+    learner, settings = learner_of(copy), copy.config.networks
+    once, eta = FitSettings(max_epochs=1), 0.01
+    recipe = Recipe(
+        factors=settings.factors.model_copy(update={"eta": eta, "fit": once}),
+        combiner=CombinerSettings(correction=DenseSettings(hidden=[4], fit=once), eta=eta),
+    )
+    root = np.sqrt(WeightedNorm.of(learner.collection.reference, eta).squared)
+    for part in learner.composite(recipe).parts:
+        factor = part.scaling.factor.numpy()
+        np.testing.assert_allclose(factor / factor[0], root / root[0], rtol=1e-5)
 
 
 def test_every_run_of_the_pages_has_valid_studies() -> None:
