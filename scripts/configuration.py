@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from shapespace.training.runs.config import Config
+from shapespace.training.runs.config import IGNORED, Config
 
 TARGET = Path(__file__).parents[1] / "docs" / "reference" / "configuration.md"
 HEAD = """\
@@ -50,7 +50,7 @@ RESEARCH = """\
 The defaults were chosen on several collections. These settings make the variants on the
 [pages of measurements](../measurements/results.md), among them the paper's own networks.
 """
-IGNORED = """\
+NO_EFFECT = """\
 ## Settings of version 0.2 that have no effect
 
 The run reads and ignores {}. `python -m benchmarks.studies` trains such variants now.
@@ -110,17 +110,12 @@ def shown(default: BaseModel | None, name: str, field: FieldInfo) -> Any:
     return getattr(default, name) if default else field.get_default(call_default_factory=True, validated_data={})
 
 
-def _is_ignored(field: FieldInfo) -> bool:
-    return (field.description or "").startswith("Not used any more")
-
-
 class Page:
     """The reference page: each model once, with all tables that it describes."""
 
     def __init__(self) -> None:
         #: The tables of each model: path, kind (or empty), and default.
         self.places: dict[type[BaseModel], list[tuple[str, str, BaseModel | None]]] = {}
-        self._ignored: list[str] = []
         self._visit(Config, "", "", None)
 
     def _visit(self, model: type[BaseModel], path: str, kind: str, default: BaseModel | None) -> None:
@@ -171,9 +166,7 @@ class Page:
             yield ""
         rows = []
         for name, field in model.model_fields.items():
-            if _is_ignored(field):
-                self._ignored.append(f"`{path}.{name}`")
-            elif not (kind and name == "kind"):
+            if f"{path}.{name}" not in IGNORED and not (kind and name == "kind"):
                 rows.append(self._row(name, field, default))
         if rows:
             yield from ("| setting | type | default | meaning |", "|---|---|---|---|", *rows, "")
@@ -184,8 +177,8 @@ class Page:
         for model, ((path, _, _), *_others) in self.places.items():
             part = research if path.startswith(("networks.", "monolithic")) else lines
             part.extend(self._section(model) if path else ())
-        self._ignored += [f"`{name}`" for name, field in Config.model_fields.items() if _is_ignored(field)]
-        return "\n".join([*lines, *research, IGNORED.format(", ".join(self._ignored))]).rstrip() + "\n"
+        ignored = NO_EFFECT.format(", ".join(f"`{name}`" for name in IGNORED))
+        return "\n".join([*lines, *research, ignored]).rstrip() + "\n"
 
 
 if __name__ == "__main__":

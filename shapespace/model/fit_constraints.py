@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.model.decoder import Decoder, MeshChoice
+from shapespace.model.latent_space import LatentSpace
 from shapespace.model.options import FitOptions, Landmark, Prior, ScaleChoice
 from shapespace.model.population import Population
 from shapespace.model.scan import InvalidScanError
@@ -17,6 +19,9 @@ from shapespace.model.scan import InvalidScanError
 LANDMARKS = 1000
 #: How far outside the bounds codes of the population may lie, as a fraction of the bounds' width.
 MARGIN = 0.5
+#: Weight of the code's plausibility where fits are compared. Four standard deviations cost as much as leaving 16 times
+#: this share of the scan unexplained.
+PLAUSIBLE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +67,15 @@ class FitConstraints:
             lower=lower,
             upper=upper,
         )
+
+    @cached_property
+    def whiten(self) -> FloatArray:
+        """Matrix (m, m) that takes changes of a code to scores in the prior."""
+        return np.asarray(np.linalg.inv(self.prior.root), np.float64)
+
+    def scores(self, code: FloatArray, latents: LatentSpace) -> FloatArray:
+        """Return the scores (m,) of a code in the prior, angles the shorter way round."""
+        return self.whiten @ latents.shorter(code - self.prior.mean)
 
 
 def _require_landmark(i: int, landmark: Landmark, count: int) -> None:

@@ -16,7 +16,7 @@ from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.derivatives import carried, derivatives, factor_derivatives
 from shapespace.model.feature_search import FeatureSearch
-from shapespace.model.fit_constraints import FitConstraints
+from shapespace.model.fit_constraints import PLAUSIBLE, FitConstraints
 from shapespace.model.fit_result import FitState, VertexDerivatives
 from shapespace.model.pairing import Pairing, Pairs
 from shapespace.model.scan import Scan, independent_points
@@ -45,9 +45,6 @@ class SearchSettings:
     # points within this distance of the model count as explained; at most twice this distance with noise
     near: float = 0.01
     compared: float = 0.02  # where fits are compared, a point at this distance counts as half explained
-    # Weight of the code's plausibility in that comparison. Four standard deviations cost as much as leaving 16 times
-    # this share of the scan unexplained.
-    plausible: float = 0.001
 
 
 SETTINGS = SearchSettings()
@@ -97,7 +94,7 @@ class FitSearch:
             scan, accuracy.points, vertices, both=not constraints.partial, blended=not accuracy.rough
         )
         self._diagonal = decoder.reference.diagonal
-        self._whiten: FloatArray = np.asarray(np.linalg.inv(constraints.prior.root), np.float64)
+        self._whiten = constraints.whiten
         self.reconstruct = reconstruct
         self._changes = derivatives if accuracy.mesh is MeshChoice.FINE else factor_derivatives
         self._shapes = SearchedShapes(decoder, reconstruct, deadline, SETTINGS.tolerance, rough=accuracy.rough)
@@ -224,12 +221,8 @@ class FitSearch:
     def _cost(self, state: FitState, pairs: Pairs) -> float:
         squares = pairs.distances**2
         missed = squares / (squares + (SETTINGS.compared * self._diagonal) ** 2)
-        away = self._away(state.code)
-        return float((pairs.mass * missed).sum() / pairs.mass.sum() + SETTINGS.plausible * away @ away)
-
-    def _away(self, code: FloatArray) -> FloatArray:
-        """Return the scores (m,) of a code in the prior, angles the shorter way round."""
-        return self._whiten @ self._decoder.latents.shorter(code - self.constraints.prior.mean)
+        away = self.constraints.scores(state.code, self._decoder.latents)
+        return float((pairs.mass * missed).sum() / pairs.mass.sum() + PLAUSIBLE * away @ away)
 
     def derivatives(self, state: FitState) -> VertexDerivatives:
         """Compute derivatives at a state. Raises NotPositiveDefiniteError."""
@@ -303,7 +296,7 @@ class FitSearch:
             own += part
         prior, count = self._whiten[:, self.constraints.movable], fields.shape[-1]
         H[:count, :count] += prior.T @ prior
-        g[:count] -= prior.T @ self._away(state.code)
+        g[:count] -= prior.T @ self.constraints.scores(state.code, self._decoder.latents)
         if not (np.isfinite(H).all() and np.isfinite(g).all()):  # networks overflow far outside the bounds
             return None
         try:

@@ -11,7 +11,7 @@ from shapespace.arrays import FloatArray
 from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.decoder import Decoder
-from shapespace.model.fit_constraints import FitConstraints
+from shapespace.model.fit_constraints import PLAUSIBLE, FitConstraints
 from shapespace.model.fit_result import FitState
 from shapespace.model.placement import evenly
 from shapespace.model.scan import Scan, nearest_points
@@ -23,8 +23,6 @@ PARTS, POINTS = 12, 300
 LONG, SHORT = 0.1, 0.03
 #: Vertices of a shape with larger coordinates are no shape; the model is normalised.
 HUGE = 1e6
-#: Weight of the code's plausibility, as in the search.
-PLAUSIBLE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +45,7 @@ class ShapeJudge:
             some = shape[:: max(1, len(shape) // POINTS)]
             back = (self.scan.distances(state.placement(some)) / state.placement.scale) ** 2
             cost += float((back / (back + square)).mean())
-        away = self.decoder.latents.shorter(code - self.constraints.prior.mean)
-        scores = np.linalg.solve(self.constraints.prior.root, away)
+        scores = self.constraints.scores(code, self.decoder.latents)
         return cost + PLAUSIBLE * float(scores @ scores)
 
 

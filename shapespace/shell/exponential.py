@@ -275,19 +275,18 @@ class _CentredStep:
         self.current = start
         self._stride = stride
 
-    def _both(self, unknown: ShellPoint) -> tuple[tuple[_Step, ShellPoint], tuple[_Step, ShellPoint]]:
-        before = self.current.space.point(unknown.vertices - 2 * self._stride)
-        return (_Step(before, self.current, True), unknown), (_Step(unknown, self.current, False), before)
+    def _before(self, unknown: ShellPoint) -> ShellPoint:
+        return self.current.space.point(unknown.vertices - 2 * self._stride)
 
     def forces(self, unknown: ShellPoint) -> FloatArray:
         """Compute F (V, 3)."""
-        (forward, after), _ = self._both(unknown)
-        return forward.forces(after) / 2
+        return _Step(self._before(unknown), self.current, True).forces(unknown) / 2
 
     def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
         """Compute ``DF(X)`` (3V, 3V)."""
-        (forward, after), (backward, before) = self._both(unknown)
-        return sparse.csc_array((forward.derivative(after) + backward.derivative(before)) / 2)
+        before = self._before(unknown)
+        forward, backward = _Step(before, self.current, True), _Step(unknown, self.current, False)
+        return sparse.csc_array((forward.derivative(unknown) + backward.derivative(before)) / 2)
 
 
 _Equation = _Step | _CentredStep

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ from shapespace.training.runs.settings import (
     SampleSettings,
     SettingsTable,
 )
+
+#: Settings of version 0.2 that a run reads and ignores.
+IGNORED = ("networks.fractions", "networks.seeds", "variants")
 
 
 class ConfigError(ValueError):
@@ -58,12 +62,7 @@ class Config(SettingsTable):
     @property
     def unused(self) -> list[str]:
         """Names of the given settings that only version 0.2 used."""
-        studies = {
-            "networks.fractions": self.networks.fractions,
-            "networks.seeds": self.networks.seeds,
-            "variants": self.variants,
-        }
-        return [name for name, value in studies.items() if value]
+        return [name for name in IGNORED if attrgetter(name)(self)]
 
     @model_validator(mode="after")
     def _usable_correction(self) -> Config:

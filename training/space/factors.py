@@ -51,8 +51,8 @@ def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
     """Form factors by repeatedly joining the two groups with the largest average overlap (average linkage).
 
     With a ``count``, J, joining ends when ``count`` groups are left. As long as other groups can be joined, no group
-    gets more than twice the mean number of modes: otherwise one factor may take nearly all modes of a face, too many to
-    learn. Without ``count``, two groups are joined if they have
+    gets more than twice the mean number of modes. Otherwise one factor may take nearly all modes of a face, which are
+    too many to learn. Without ``count``, two groups are joined if they have
     together at most `LARGEST_FACTOR` modes and overlap more than two modes do on average, since the usual overlap
     depends on the collection: its median is 0.4 on a captured body in loose clothes, where nearly everything moves a
     little with everything else, and 0.1 on a hand. The algorithm is written out because a dendrogram has no limit on
