@@ -71,10 +71,11 @@ if TYPE_CHECKING:
     from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
     from shapespace.model.blend_shapes import PeriodicError
     from shapespace.model.correspondence import InvalidMeshError
-    from shapespace.model.decoder import MeshChoice, ModelFailedError
+    from shapespace.model.decoder import MeshChoice
     from shapespace.model.edit import InvalidTargetError
     from shapespace.model.fit_result import FitStatus
     from shapespace.model.latent_space import Bounds, Distribution, LatentError
+    from shapespace.model.networks import ModelFailedError
     from shapespace.model.options import (
         EditOptions,
         EncodeOptions,
@@ -115,10 +116,11 @@ _NAMES = {
     "mesh.triangle_mesh": "MeshError TriangleMesh",
     "model.blend_shapes": "PeriodicError",
     "model.correspondence": "InvalidMeshError",
-    "model.decoder": "MeshChoice ModelFailedError",
+    "model.decoder": "MeshChoice",
     "model.edit": "InvalidTargetError",
     "model.fit_result": "FitStatus",
     "model.latent_space": "Bounds Distribution LatentError",
+    "model.networks": "ModelFailedError",
     "model.options": "EditOptions EncodeOptions FitOptions Landmark Objective Prior PriorKind ScaleChoice Target",
     "model.scan": "InvalidScanError",
     "model.shape": "Quality",

@@ -15,10 +15,10 @@ from starlette.routing import Match
 
 from shapespace.model.blend_shapes import PeriodicError
 from shapespace.model.correspondence import InvalidMeshError
-from shapespace.model.decoder import ModelFailedError, NetworkTimeError
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.networks import ModelFailedError, NetworkTimeError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from shapespace.service.http.problems import ProblemError, problem, shortened

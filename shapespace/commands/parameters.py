@@ -22,8 +22,8 @@ from shapespace.files.atomic import replaced_file
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, VTK_FORMATS
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.model.correspondence import InvalidMeshError
-from shapespace.model.decoder import ModelFailedError
 from shapespace.model.latent_space import LatentError
+from shapespace.model.networks import ModelFailedError
 from shapespace.model.options import descriptions
 from shapespace.model.scan import InvalidScanError
 

@@ -1,6 +1,5 @@
 """Decoding: networks turn latent codes into lengths and angles, and Gauss–Newton turns these into vertices."""
 
-import logging
 import queue
 import threading
 import time
@@ -22,20 +21,16 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.memory import FACTOR, Examples, Fade, on_segment, switched
-from shapespace.model.networks import PATIENCE, NetworkError, Session, TerminatedError
+from shapespace.model.networks import ModelFailedError, Patience, Session
 from shapespace.model.population import Population
 from shapespace.model.shape import Diagnostics, Quality, Shape
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
-logger = logging.getLogger(__name__)
 #: Gauss–Newton stops when no vertex moves by more than this fraction of the diagonal: a fiftieth of a pixel if a shape
 #: fills a screen.
 TOLERANCE = 2e-5
-#: After a timeout, the networks' time limit is halved, down to LEAST_PATIENCE seconds. Each answer in time multiplies
-#: the limit by RECOVERY. Otherwise repeated requests for slow codes would occupy all workers.
-LEAST_PATIENCE, RECOVERY = 0.5, 1.1
 #: Number of random codes in the self-test.
 TESTED_CODES = 2
 #: Networks run for several codes at once, with at most this number of edges together. More take longer for each code,
@@ -47,14 +42,6 @@ ITERATIONS_OUTSIDE = 60
 #: Largest share of triangles whose predicted sides can't form a triangle. Inside the bounds of the bundled models there
 #: are none. Beyond a tenth, a third of the faces of the solved shape are flipped.
 BROKEN_TRIANGLES = 0.1
-
-
-class ModelFailedError(RuntimeError):
-    """Networks failed at a code. The message says what to do, and the cause names the network and the fault."""
-
-
-class NetworkTimeError(ModelFailedError):
-    """Networks exceeded their time limit at a code."""
 
 
 class MeshChoice(StrEnum):
@@ -115,7 +102,7 @@ class Decoder:
         self._solvers.put(self._first_solver)
         #: Number of solvers that may still be made. A server with many threads rarely needs all of them.
         self._solvers_left, self._lock = threads - 1, threading.Lock()
-        self._patience = PATIENCE
+        self._patience = Patience(f"{manifest.name}/{manifest.version}")
 
     def mesh(self, choice: MeshChoice) -> TriangleMesh:
         """Return the normalised reference as the fine or the coarse mesh; every shape has its faces."""
@@ -267,7 +254,7 @@ class Decoder:
         yield z[0]
         for j, factor in enumerate(self.manifest.factors):
             for k in range(factor.start, factor.stop):
-                with self._limited() as until:
+                with self._patience.limited() as until:
                     part, others = code[None, factor.start : factor.stop].copy(), factors.copy()
                     part[0, k - factor.start] += steps[k]
                     others[:, j] = self._factors[j](part.astype(np.float32), until)
@@ -280,7 +267,7 @@ class Decoder:
         size = max(1, BATCH_EDGES // self.manifest.edges)
         found = []
         for k in range(0, len(parts), size):
-            with self._limited() as until:
+            with self._patience.limited() as until:
                 own = self._factors[j](parts[k : k + size].astype(np.float32), until)
                 others = np.repeat(factors, len(own), axis=0)
                 others[:, j] = own
@@ -289,14 +276,14 @@ class Decoder:
 
     def factor(self, j: int, parts: FloatArray) -> FloatArray:
         """Return the NRIC (n, 2E) of factor j for its parts (n, m_j) of codes, normalised."""
-        with self._limited() as until:
+        with self._patience.limited() as until:
             return self._factors[j](parts.astype(np.float32), until).astype(np.float64)
 
     def guesses(self, codes: Codes) -> FloatArray:
         """Return the start network's normalised shapes (n, V, 3) of codes (n, m); ValueError if there is none."""
         if self._start is None:
             raise ValueError("the bundle has no start network")
-        with self._limited() as until:
+        with self._patience.limited() as until:
             return self._start(codes, until).astype(np.float64)
 
     def self_test(self) -> None:
@@ -353,7 +340,7 @@ class Decoder:
         self, codes: Codes, memory: NDArray[np.float32] | None = None
     ) -> tuple[NDArray[np.float32], FloatArray]:
         """Return factors (n, J, 2E) and combined NRIC (n, 2E), normalised. ``memory`` are factors of the memory."""
-        with self._limited() as until:
+        with self._patience.limited() as until:
             parts = [
                 session(codes[:, factor.start : factor.stop], until)
                 for session, factor in zip(self._factors, self.manifest.factors, strict=True)
@@ -377,23 +364,6 @@ class Decoder:
     def _learned_start(self, code: Codes) -> Iterator[Callable[[], FloatArray]]:
         if self._start:
             yield lambda: self.guesses(code[None])[0]
-
-    @contextmanager
-    def _limited(self) -> Iterator[float]:
-        """Yield the time at which networks must have answered; turn their errors into ModelFailedError."""
-        patience = self._patience
-        try:
-            yield time.monotonic() + patience
-            self._patience = min(PATIENCE, RECOVERY * self._patience)
-        except NetworkError as error:
-            logger.error("model %s/%s: %s", self.manifest.name, self.manifest.version, error)
-            what_to_do = "Choose another code or model, and tell the operator of the server."
-            if isinstance(error, TerminatedError):
-                self._patience = max(patience / 2, LEAST_PATIENCE)
-                raise NetworkTimeError(
-                    f"The model's networks did not answer within {patience:g} s at this code. {what_to_do}"
-                ) from error
-            raise ModelFailedError(f"The model's networks failed at this code. {what_to_do}") from error
 
     @contextmanager
     def solver(self) -> Iterator[Reconstructor]:

@@ -1,8 +1,10 @@
 """ONNX networks with a time limit for each run."""
 
+import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,10 @@ from shapespace.bundle.schema import Network
 
 #: Time limit of the networks for one code, in seconds: hundreds of times what they need.
 PATIENCE = 5.0
+#: After a timeout, the time limit is halved, down to LEAST_PATIENCE seconds. Each answer in time multiplies it by
+#: RECOVERY. Otherwise repeated requests for slow codes would occupy all workers.
+LEAST_PATIENCE, RECOVERY = 0.5, 1.1
+logger = logging.getLogger(__name__)
 #: Log only fatal errors: ONNX Runtime's messages quote names from the file, which may come from an untrusted source.
 _FATAL = 4
 onnxruntime.set_default_logger_severity(_FATAL)
@@ -25,6 +31,39 @@ class NetworkError(RuntimeError):
 
 class TerminatedError(NetworkError):
     """A network was stopped at its time limit."""
+
+
+class ModelFailedError(RuntimeError):
+    """Networks failed at a code. The message says what to do, and the cause names the network and the fault."""
+
+
+class NetworkTimeError(ModelFailedError):
+    """Networks exceeded their time limit at a code."""
+
+
+class Patience:
+    """Time limit of all networks of a model for one code, see LEAST_PATIENCE. ``model`` is its name for the log."""
+
+    def __init__(self, model: str) -> None:
+        self._model = model
+        self.seconds = PATIENCE
+
+    @contextmanager
+    def limited(self) -> Iterator[float]:
+        """Yield the time at which networks must have answered; turn their errors into ModelFailedError."""
+        seconds = self.seconds
+        try:
+            yield time.monotonic() + seconds
+            self.seconds = min(PATIENCE, RECOVERY * self.seconds)
+        except NetworkError as error:
+            logger.error("model %s: %s", self._model, error)
+            what_to_do = "Choose another code or model, and tell the operator of the server."
+            if isinstance(error, TerminatedError):
+                self.seconds = max(seconds / 2, LEAST_PATIENCE)
+                raise NetworkTimeError(
+                    f"The model's networks did not answer within {seconds:g} s at this code. {what_to_do}"
+                ) from error
+            raise ModelFailedError(f"The model's networks failed at this code. {what_to_do}") from error
 
 
 class _Watch:

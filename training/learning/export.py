@@ -20,8 +20,9 @@ from shapespace.bundle.schema import COMBINER, START, Network, Origin, Tolerance
 from shapespace.bundle.writer import Facts, Networks, write_bundle
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.model.accuracy import measure_accuracy
-from shapespace.model.decoder import Decoder, ModelFailedError
+from shapespace.model.decoder import Decoder
 from shapespace.model.latent_space import NotFiniteError
+from shapespace.model.networks import ModelFailedError
 from shapespace.shell.energy import Material
 from shapespace.training.learning import ExportError
 from shapespace.training.learning.composite import Composite

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from shapespace.bundle.reader import read_bundle
-from shapespace.model.decoder import LEAST_PATIENCE, ModelFailedError, NetworkTimeError
+from shapespace.model.networks import LEAST_PATIENCE, ModelFailedError, NetworkTimeError
 from shapespace.model.shape_model import ShapeModel
 from tests.service import hostile
 from tests.service.bundles import write_bundle
@@ -74,7 +74,7 @@ def test_a_network_that_hangs_is_ended_and_the_others_go_on(client: httpx.Client
     assert {answer.json()["type"] for answer in answers} == {TYPE}
     details = {answer.json()["detail"] for answer in answers}
     assert any("did not answer within 5 s at this code" in detail for detail in details), details
-    assert f"ERROR shapespace.model.decoder: model {model}/1: factor-0.onnx does not answer in time" in server.log
+    assert f"ERROR shapespace.model.networks: model {model}/1: factor-0.onnx does not answer in time" in server.log
     assert ask(client, model, GOOD).json()["vertices"] == right.json()["vertices"]
 
 
@@ -148,7 +148,7 @@ def test_a_model_that_has_hung_gets_less_time(tmp_path: Path, caplog: pytest.Log
         times.append(time.monotonic() - began)
     # Only lower limits are tested; how much longer each takes depends on the machine.
     assert all(took >= least for took, least in zip(times, (5, 2.5, 1.25, 0.625, 0.5, 0.5), strict=True)), times
-    assert loops.decoder._patience == LEAST_PATIENCE
+    assert loops.decoder._patience.seconds == LEAST_PATIENCE
     assert loops.shape(loops.latents.code(GOOD)[0]).diagnostics.status == "converged"
 
 
