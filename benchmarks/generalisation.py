@@ -51,11 +51,7 @@ Each collection also has a row with half of its modes.
 {simple}
 
 Each figure is the error as a share of the error of principal components. {collections}
-
-- *Components with memory* correct their errors at the training shapes, as our bundles do.
-- *Straight lines of lengths and angles* are principal components of lengths and angles; Gauss–Newton finds the
-  vertices.
-- *Differential coordinates* are principal components of the rotations and stretches of faces.
+[Choosing](../explanation/choosing.md#what-generalisation-means) explains these models.
 
 ## With mirror images
 

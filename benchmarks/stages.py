@@ -60,8 +60,8 @@ is the whole run without the time to start, and the memory of its largest proces
 - Meshes of more than 20,000 vertices are first thinned by many collapses at once. So 40,000 vertices take no longer
   than 10,000. We do not know why reading takes less time with 2,000 coarse vertices than with 1,000.
 
-{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on them
-with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
+{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on
+them with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
 """
 
 
