@@ -51,7 +51,10 @@ Each collection also has a row with half of its modes.
 {simple}
 
 Each figure is the error as a share of the error of principal components. {collections}
-[Choosing](../explanation/choosing.md#what-generalisation-means) explains these models.
+
+- *Components with memory* correct their errors at the training shapes, as our bundles do.
+- The last two columns are the maps `nric` (lengths and angles) and `differential` (rotations and stretches of faces),
+  which [training can choose](../explanation/choosing.md#map-from-codes-to-shapes).
 
 ## With mirror images
 
