@@ -26,25 +26,24 @@ from shapespace.training.runs.directory import RunDirectory
 PAGE = """# Fine detail
 
 How much of the fine mesh of your files is left in an answer? A model computes the [coarse
-mesh](../reference/glossary.md#coarse-and-fine-mesh), and weights carry the fine mesh along.
+mesh](../reference/glossary.md#coarse-and-fine-mesh), and fixed weights compute the fine mesh from it.
 
-- The weights cost at most 0.02 % of the diagonal, and the surface stays as rough as it was.
-- Answers for unseen shapes are as rough as the files too, with two exceptions. **Organs (hippocampi) lose a fifth of
-  their roughness**, and unseen horses gain 7 %.
+- The weights cost at most 0.02 % of the [diagonal](../reference/glossary.md#diagonal) and keep the roughness.
+- Answers for unseen shapes are as rough as the files, with two exceptions. **Organs (hippocampi) lose a fifth of their
+  roughness**, and horses gain 7 %.
 
 {table}
 
-Each cell has the error of the weights alone → the error of the whole answer, for [unseen
-shapes](../reference/glossary.md#unseen-shape). *Weights alone* takes the coarse vertices from the file. The *whole
-answer* is the fine mesh of the code that `encode` finds for the file.
+Each cell has two errors: the weights alone → the whole answer. For the weights alone, we took the coarse vertices from
+the file of an [unseen shape](../reference/glossary.md#unseen-shape). The whole answer is the shape of the code that
+`encode` finds for the file.
 
-- **distance**: mean over all vertices after alignment, in percent of the
-  [diagonal](../reference/glossary.md#diagonal).
+- **distance**: mean over all vertices after alignment, in percent of the diagonal.
 - **normals**: median angle in degrees between the normal of a face and the same normal in the file.
 - **roughness**: median angle between the normals of neighbouring faces, divided by the same angle in the file.
 
-Measured in the first fold of [served models](served.md) of {version}. Distances over all folds are on that
-page. `python -m benchmarks.detail` measures and writes this page.
+Measured in the first fold of [served models](served.md) of {version}. `python -m benchmarks.detail` measures and
+writes this page.
 """
 
 

@@ -40,21 +40,19 @@ move {mean} mm on average, {most} mm in the worst pull.
 
 - [**`prior_kind`**](../reference/http.md#edit-move-vertices-to-targets): how a change is spread over the code.
   `groups` is the default.
-- **others move**: mean distance that the vertices of the other limbs and of the head move, as mean / largest over the
-  pulls.
-- **target is missed by**: distance from the target as a share of the pull, as median / largest.
+- **others move**: mean distance over the vertices of the other limbs and the head, as mean / largest of all pulls.
+- **target is missed by**: distance as a share of the pull, as median / largest.
 - **factors that change**: mean number of [factors](../reference/glossary.md#factor) that change by more than 1 % of
   their bounds.
-- **shapes computed**: number of shapes that the search computes, the first included, as mean / largest.
+- **shapes computed**: by the search, with the first one, as mean / largest.
 
-There are {count} pulls by {pull} m from random codes. We took each target from a shape that differs in one factor of
-this limb, so it is within reach. `python -m benchmarks.edit` measures and writes this page.
+There are {count} pulls by {pull} m from random codes. Each target is within reach, because a shape that differs in one
+factor of this limb has it. `python -m benchmarks.edit` measures and writes this page.
 
 ## Errors and times
 
 `encode` finds codes almost exactly, and `edit` mostly reaches its targets within 1 %. Both take as long as 10 to 31
-full shapes. Targets out of reach take 44 shapes of the figure and 32 of the torus at the median (12 edits each,
-November 2026). One edit of the torus with five targets took 380.
+full shapes.
 
 | | median error | largest | over 1 % | time, in shapes |
 |---|---|---|---|---|
@@ -63,11 +61,13 @@ November 2026). One edit of the torus with five targets took 380.
 | torus, `encode` | 0.0008 % | 0.0012 % | 1 of 200 | 9.8 |
 | torus, `edit` | 0.08 % | 1.15 % | 2 of 40 | 23.7 |
 
-- **`encode`**: shapes of random codes, turned, moved and rounded. The error is a share of a coordinate's range;
+- **`encode`** gets shapes of random codes, turned, moved and rounded. The error is a share of a coordinate's range;
   *largest* is the median error of the worst coordinate.
-- **`edit`**: 1 to 10 vertices go to their places on the shape of another code. The error is the largest distance from
-  a target, as a share of the diagonal.
-- An edit of all 4601 vertices takes a second, because at most 32 targets choose the first move.
+- **`edit`** moves 1 to 10 vertices to their places on the shape of another code. The error is the largest distance from
+  a target, as a share of the [diagonal](../reference/glossary.md#diagonal).
+- **Targets out of reach** take 44 shapes of the figure and 32 of the torus at the median (12 edits each, November
+  2026). One edit of the torus with five targets took 380.
+- **All 4601 vertices** at once take a second, because at most 32 targets choose the first move.
 
 `python -m benchmarks.codes --count 200` measured this table with version 0.2, on one thread beside other processes.
 """

@@ -28,13 +28,12 @@ FIGURES = ROOT / "runs" / "folds"
 
 PAGE = """# Unseen shapes, by modes alone
 
-How near can modes come to a shape that we did not use to find them? This page has the answer for exact
-[exponentials](../reference/glossary.md#exponential), on coarse meshes. [Errors on unseen shapes](served.md) has it
-for models as the server runs them.
+How near can modes come to a shape that was not used to find them? Here exact
+[exponentials](../reference/glossary.md#exponential) compute the shapes, on coarse meshes. For models as the server
+runs them, see [errors on unseen shapes](served.md).
 
-The error is the mean distance of a vertex from its place, in percent of the
-[diagonal](../reference/glossary.md#diagonal). Each collection has a row with half of its modes and a row with all. K
-is the number of [time steps](../reference/glossary.md#time-steps). {measured}
+Errors are mean distances of vertices in percent of the [diagonal](../reference/glossary.md#diagonal). K is the number
+of [time steps](../reference/glossary.md#time-steps). {measured}
 
 ## Modes and principal components
 
@@ -42,6 +41,8 @@ With all modes, the error is {gain} of the error of as many principal components
 others it is {rest}.
 
 {plain}
+
+Each collection also has a row with half of its modes.
 
 ## Stronger simple models
 
@@ -52,9 +53,8 @@ others it is {rest}.
 Each figure is the error as a share of the error of principal components. {collections}
 
 - *Components with memory* correct their errors at the training shapes, as our bundles do.
-- *Straight lines of lengths and angles* are principal components of lengths and angles; Gauss–Newton finds the
-  vertices.
-- *Differential coordinates* are principal components of the rotations and stretches of faces.
+- The last two columns are the maps `nric` (lengths and angles) and `differential` (rotations and stretches of faces),
+  which [training can choose](../explanation/choosing.md#map-from-codes-to-shapes).
 
 ## With mirror images
 
@@ -63,19 +63,17 @@ posed bodies (makehuman), modes stay better than components.
 
 {mirrored}
 
-The ratio is to components with images. These rows have other coarse meshes than the first table, so compare within a
-row.
+The ratio is to components with images. Coarse meshes differ from those in the first table, so compare within a row.
 
 ## How it was measured
 
-- Five [folds](../reference/glossary.md#fold): each shape is left out once, and mean, logarithms and modes come from
-  the other shapes. The error is the distance of the nearest exponential from the shape left out, after rigid
-  alignment.
+- Five [folds](../reference/glossary.md#fold) leave each shape out once. Mean, logarithms and modes come from the other
+  shapes. The error is the distance of the nearest exponential after rigid alignment.
 - All models have the same folds, meshes and number of coordinates, and find codes by vertices.
 - Coarse meshes have at most a thousand vertices. K is {steps}, or 1 where a fold chose it.
 - No fold chooses by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with such folds in view.
-- For makehuman the ratios are upper bounds. For some of its poses faces collapse on the way, and the exponential ends
+- For makehuman the ratios are upper bounds: faces collapse on the way to some of its poses, and the exponential ends
   there. [Networks](served.md) still give a shape, which is nearer.
 - `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles,
   are in `runs/folds/`.

@@ -52,11 +52,15 @@ GLB = MESH_FORMATS["glb"].encode
 BANDED = 5000
 PAGE = """# Serving
 
-How long does the server take for a shape, where does the time go, and how does it grow?
+How long does the server take for a shape, where does the time go, and how does it grow? Times are [CPU
+time](../reference/glossary.md#cpu-time) of one thread in milliseconds, medians over {count} codes, unless a table says
+otherwise.
+"""
+END = """
+## How it was measured
 
-Unless a table says otherwise, times are [CPU time](../reference/glossary.md#cpu-time) of one thread in milliseconds,
-medians over {count} codes. `python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with
-version {version}. [benchmarks/NOTES.md](../../benchmarks/NOTES.md#performance) says why the server is as fast as it is.
+`python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with version {version}. [The
+notes](../../benchmarks/NOTES.md#performance) say why the server is as fast as it is.
 """
 #: Numbers of codes that a graph takes at once.
 BATCHES = (1, 8, 64)
@@ -368,8 +372,8 @@ def main() -> None:
     with redirect_stdout(io.StringIO()) as text:
         run(arguments)
     day = f"{datetime.now(UTC):%Y-%m-%d}"
-    page = PAGE.format(day=day, count=arguments.count, version=shapespace.__version__)
-    pages.write("serving", page + text.getvalue())
+    end = END.format(day=day, version=shapespace.__version__)
+    pages.write("serving", PAGE.format(count=arguments.count) + text.getvalue() + end)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -42,8 +42,8 @@ COLUMNS = ("ingest", "modes", "samples", "networks")
 
 PAGE = """# How training grows
 
-How much time and memory does a training run need, and what makes it need more? [Is it for my
-data?](../is-it-for-me.md) has the minutes of whole runs. Here one size is changed at a time.
+How much time and memory does a training run need, and what makes it need more? Each row changes one size of a base run.
+[Is it for my data?](../is-it-for-me.md) has the minutes of whole runs.
 
 - **Time**: `ingest` grows with files of more than 40,000 vertices, and `modes` with the number of shapes. All other
   [stages](../reference/run-directory.md) grow with the coarse mesh.
@@ -51,18 +51,17 @@ data?](../is-it-for-me.md) has the minutes of whole runs. Here one size is chang
 
 {table}
 
-Figures are seconds of [CPU time](../reference/glossary.md#cpu-time) with all workers. *All* is the whole run without
-the time to start, and the resident memory of its largest process. Workers are further processes, one for each core.
+Stages are in seconds of [CPU time](../reference/glossary.md#cpu-time), with worker processes (one for each core). *All*
+is the whole run without the time to start, and the memory of its largest process.
 
 - The base has {base.shapes} shapes of {base.fine:,} vertices, {base.coarse} coarse vertices and {base.modes} modes.
-  Each other row changes one of these numbers.
 - `samples` and `networks` also grow with the number of samples: here {joint} joint ones and {factors} of each factor.
   The defaults are 4000 and 1000.
 - Meshes of more than 20,000 vertices are first thinned by many collapses at once. So 40,000 vertices take no longer
-  than 10,000. We do not know why 2,000 coarse vertices take less time than 1,000 to read.
+  than 10,000. We do not know why reading takes less time with 2,000 coarse vertices than with 1,000.
 
-{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` runs the real
-command on them, with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
+{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on
+them with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
 """
 
 
