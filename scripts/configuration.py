@@ -40,8 +40,8 @@ licence = "CC0-1.0"
 "upper right" = "thumb"
 ```
 
-The run refuses unknown settings. A dotted heading such as `networks.factors` is a table `[networks.factors]`. Words such
-as *mode* and *factor* are in the [glossary](glossary.md).
+The run refuses unknown settings. A dotted heading such as `networks.factors` is a table `[networks.factors]`. Words
+such as *mode* and *factor* are in the [glossary](glossary.md).
 """
 RESEARCH = """\
 ## For research: kinds of networks
