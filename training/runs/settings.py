@@ -69,8 +69,8 @@ class CollectionSettings(SettingsTable):
     """Number of vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with
     all."""
     mirror: bool = True
-    """Whether to learn from [mirror images](glossary.md#mirror-image) too. One of the shapes must have exactly one
-    plane of symmetry."""
+    """Whether to learn from [mirror images](glossary.md#mirror-image) too, if one of the shapes has exactly one plane
+    of symmetry."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -162,15 +162,16 @@ class SampleSettings(SettingsTable):
     """Number of joint samples, which take most of a run's time. 500 are enough for a first look."""
     steps: int | None = Field(None, ge=1)
     """Number K of [time steps](glossary.md#time-steps) of exponentials, ``modes.log_steps`` by default. If that is
-    ``auto`` and the first step centred: the smallest of 8, 12, 16, 24 and 32 with 1 − R² of at most 1e-5."""
+    ``auto`` and the first step is centred: the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps
+    is at most 1e-5."""
     factor_counts: list[int] | int | None = None
     """Number of samples of each factor alone: one for all factors, or a list. By default 1000, but at most
     ``count``."""
     shapes: bool = True
     """Whether the codes of the collection's own shapes are training samples too, at most a quarter of ``count``."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples with derivatives by the code. Each takes as long as ten others. They pay if there are
-    only a few hundred samples. By default 60, but at most a tenth of ``count``."""
+    """Number of joint samples with derivatives by the code. Each takes as long as about ten others, and helps more if
+    there are only a few hundred. By default 60, but at most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
     """Samples per file. A worker computes one file at a time, and loses it if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
@@ -205,8 +206,8 @@ class EvaluationSettings(SettingsTable):
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in all figures."""
     baselines: bool = False
-    """Whether to train ``monolithic`` and ``monolithic_paper`` too, networks with one factor. This doubles the time of
-    the stage ``networks``."""
+    """Whether to train ``monolithic`` and ``monolithic_paper`` too, networks with one factor. This about doubles the
+    time of the stage ``networks``."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
     """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 leaves it out. It may take as long
     as all samples. Needs ``baselines``."""
