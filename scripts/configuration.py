@@ -18,7 +18,7 @@ HEAD = """\
 # Configuration
 
 Every setting of a file for `shapespace run`. `shapespace init` writes such a file for your meshes. Most files need
-little more than this:
+only this:
 
 ```toml
 [collection]
@@ -40,15 +40,14 @@ licence = "CC0-1.0"
 "upper right" = "thumb"
 ```
 
-A setting marked *required* has to be there. The run refuses unknown settings. A dotted heading such as
-`networks.factors` is a table `[networks.factors]`. The [glossary](glossary.md) explains words such as *mode*, *factor*
-and *NRIC*.
+The run refuses unknown settings. A dotted heading such as `networks.factors` is a table `[networks.factors]`. Words
+such as *mode* and *factor* are in the [glossary](glossary.md).
 """
 RESEARCH = """\
 ## For research: kinds of networks
 
-The defaults were chosen on several collections. These settings make the variants on the
-[pages of measurements](../measurements/results.md), among them the paper's own networks.
+These settings make the variants on the [pages of measurements](../measurements/results.md), among them the paper's own
+networks.
 """
 NO_EFFECT = """\
 ## Settings of version 0.2 that have no effect

@@ -20,18 +20,17 @@ class FitSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"weight_decay"})
 
     optimiser: Literal["adam", "muon"] = "adam"
-    """``adam``, as in the paper, or ``muon``. Muon updates matrices by their orthogonalised momentum and all else as
-    Adam does. With large batches it needs fewer steps."""
+    """``adam``, as in the paper, or ``muon``: orthogonalised momentum for matrices, which needs fewer steps with large
+    batches."""
     schedule: Literal["plateau", "cosine"] = "plateau"
-    """Schedule of the learning rate. ``plateau`` divides it by ten whenever the validation loss has not fallen for
-    ``patience`` epochs, as in the paper (section 4). ``cosine`` lets it fall along half a cosine, to zero after
-    ``max_epochs``. It needs fewer epochs."""
+    """Course of the learning rate. ``plateau`` divides it by ten after ``patience`` epochs without progress, as in the
+    paper. ``cosine`` lets it fall to zero over ``max_epochs``, and needs fewer epochs."""
     learning_rate: float = Field(1e-3, gt=0)
     """Initial learning rate."""
     weight_decay: float = Field(0, ge=0)
     """Share of each weight that a step removes, per unit of the learning rate."""
     final_rate: float = Field(1e-6, gt=0)
-    """Training ends when the learning rate falls below this."""
+    """Training ends below this learning rate."""
     patience: int = Field(10, ge=1)
     """Epochs without a smaller validation loss before ``plateau`` divides the rate."""
     max_epochs: int = Field(500, ge=1)
@@ -39,13 +38,12 @@ class FitSettings(SettingsTable):
     batch_size: int = Field(64, ge=2)
     """Number of samples per step."""
     minutes: float | None = Field(None, gt=0)
-    """Most minutes of training. The time of the first epoch decides how many epochs fit."""
+    """Most minutes of training. The first epoch's time decides how many epochs fit."""
 
 
 class LatentNetworkSettings(SettingsTable):
-    """A network from latent codes to NRIC: a factor network, or a baseline on the whole code.
-
-    The baseline ``monolithic`` is this network with one factor. ``monolithic_paper`` is the paper's monolithic network.
+    """A network from codes to NRIC. ``monolithic`` is this network with one factor, ``monolithic_paper`` the
+    paper's.
     """
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "eta"})
@@ -53,30 +51,27 @@ class LatentNetworkSettings(SettingsTable):
     hidden: list[int] = Field([128, 128])
     """Width of each hidden layer."""
     normalisation: Normalisation = "before"
-    """Batch normalisation in each hidden layer: ``before`` or ``after`` its activation, or ``none``."""
+    """Batch normalisation before or after the activation of each hidden layer."""
     fourier: int = Field(1, ge=0)
-    """Highest frequency of a periodic coordinate among the inputs. 0 takes the angle itself, as the paper does."""
+    """Highest frequency of periodic coordinates among the inputs. 0 takes the angle itself, as in the paper."""
     skip_orders: list[int] = Field([])
-    """Largest frequency of each coordinate in a linear layer of Fourier products, beside the hidden layers and fitted
-    by ridge regression. An empty list leaves the layer out. All coordinates must be periodic."""
+    """Highest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression. Empty
+    for none. All coordinates must be periodic."""
     skip_degree: int = Field(3, ge=0)
-    """Total degree of the polynomials in such a layer, for factors without a periodic coordinate. 0 leaves the layer
-    out. The degree is lower for a factor that would have more than 20,000 polynomials."""
+    """Degree of the polynomials in such a layer without periodic coordinates; 0 for none. It is lowered to stay within
+    20,000 polynomials."""
     patches: int = Field(1, ge=1)
-    """Groups of neighbouring edges, each with a principal basis of its own, in the last layer."""
+    """Groups of neighbouring edges, each with its own principal basis in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
-    """Share of the variance that this basis keeps. 1 makes the last layer dense, as in the paper."""
+    """Share of the variance that this basis keeps. With 1 the last layer is dense, as in the paper."""
     support: float = Field(1, gt=0, le=1)
-    """Share of the variance on the edges that have entries in this basis. Below 1 the network is sparse: edges that
-    vary little keep their mean. This makes files smaller if the basis has a large rank."""
+    """Share of the variance on the edges in this basis. Below 1 other edges keep their mean, and files get smaller."""
     integrability: float = Field(0, ge=0)
-    """Weight, in gradient descent, of lengths and angles that fit no surface. They leave a gap between the first and
-    the last face around a vertex. The gap is linearised at the mean and scaled to the mean square error."""
+    """Weight of lengths and angles that fit no surface, in gradient descent."""
     eta: float | None = Field(None, gt=0)
-    """Weight of angles in the loss, as ``evaluation.eta`` is their weight in R². By default the loss scales lengths and
-    angles to the same variance."""
+    """Weight of angles in the loss. By default lengths and angles get the same variance."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
-    """How the network is trained."""
+    """How it is trained."""
 
     @model_validator(mode="after")
     def _of_low_rank(self) -> LatentNetworkSettings:
@@ -86,20 +81,17 @@ class LatentNetworkSettings(SettingsTable):
 
 
 class KernelSettings(SettingsTable):
-    """Kernel ridge regression on principal coefficients of the factors' shapes, with a learned metric.
-
-    Each patch of edges has a regression of its own.
-    """
+    """Kernel ridge regression on principal coefficients of the factors' shapes, with a learned metric."""
 
     kind: Literal["kernel"] = "kernel"
     coefficients: int = Field(12, ge=1)
     """Principal coefficients of each factor in a patch."""
     patches: int = Field(8, ge=1)
-    """Number of patches."""
+    """Patches of edges, each with its own regression."""
 
 
 class ProductSettings(SettingsTable):
-    """Ridge regression on products of the principal coefficients of every two factors."""
+    """Ridge regression on products of two factors' principal coefficients."""
 
     kind: Literal["products"] = "products"
     coefficients: int = Field(8, ge=1)
@@ -107,7 +99,7 @@ class ProductSettings(SettingsTable):
 
 
 class SumSettings(SettingsTable):
-    """No correction: the affine sum of the factors. Straight-line models have it, because it is exact there."""
+    """No correction: the affine sum, which is exact for straight lines."""
 
     kind: Literal["sum"] = "sum"
 
@@ -119,31 +111,30 @@ class ConvolutionSettings(SettingsTable):
 
     kind: Literal["convolutions"] = "convolutions"
     layers: int = Field(3, ge=1)
-    """Number of successive convolutions."""
+    """Number of convolutions."""
     width: int = Field(24, ge=1)
-    """Number of features of each edge after each layer."""
+    """Features of each edge after each layer."""
     neighbourhood: Neighbourhood = "star"
-    """The inputs of a convolution, in addition to the edge itself. ``star``, as in the paper, takes the sum over all
-    edges at its ends. ``flaps`` takes the edges of its two faces, each with weights of its own."""
+    """Further inputs of a convolution. ``star``, as in the paper: the sum over all edges at the edge's ends. ``flaps``:
+    the edges of its two faces, each with its own weights."""
     crop: int = Field(0, ge=0)
-    """Number of edges in the loss of a training step, a connected part of each shape. The part is chosen at random in
-    proportion to the error of the affine sum there. 0 takes whole shapes. Needs ``neighbourhood = "flaps"``."""
+    """Edges in the loss of a training step: a connected part, chosen where the affine sum is bad. 0 takes whole shapes.
+    Needs ``neighbourhood = "flaps"``."""
     residual: bool = True
-    """Whether the network learns the difference from the affine sum of the factors, and each layer the difference from
-    its input. If not, it learns the joint shape itself, as in the paper."""
+    """Whether layers learn differences from their input, and the network from the affine sum. If not, it learns the
+    joint shape, as in the paper."""
     edge_channels: int = Field(4, ge=0)
-    """Number of learned constants for each edge. They are inputs of the first layer, beside the factors' shapes."""
+    """Learned constants for each edge, as further inputs."""
     products: int = Field(0, ge=0)
-    """Principal coefficients of each factor whose products correct the affine sum first, as the kind ``products`` does.
-    0 leaves them out. Needs ``residual``."""
+    """Principal coefficients for a first correction by ``products``; 0 for none. Needs ``residual``."""
     dropout: float = Field(0.0, ge=0, lt=1)
-    """Share of the features that are set to zero after each layer during training."""
+    """Share of features set to zero in training."""
     normalisation: Normalisation = "before"
-    """Batch normalisation in each layer: ``before`` or ``after`` its activation, or ``none``."""
+    """Batch normalisation before or after the activation of each layer."""
     integrability: float = Field(0, ge=0)
-    """Weight of lengths and angles that fit no surface, as in the factor networks. Needs ``crop = 0``."""
+    """As in the factor networks. Needs ``crop = 0``."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
-    """How the network is trained."""
+    """How it is trained."""
 
     @model_validator(mode="after")
     def _consistent(self) -> ConvolutionSettings:
@@ -157,29 +148,26 @@ class ConvolutionSettings(SettingsTable):
 
 
 class DenseSettings(SettingsTable):
-    """A fully connected network on the shapes of all factors, which the paper names beside convolutions (section 3).
-
-    It has a weight for each pair of a length or angle and a unit of the first layer, so it is large.
-    """
+    """A fully connected, and so large, network on the shapes of all factors (section 3 of the paper)."""
 
     kind: Literal["dense"] = "dense"
     hidden: list[Annotated[int, Field(ge=1)]] = Field([256, 256])
     """Width of each hidden layer."""
     residual: bool = True
-    """Whether the network learns the difference from the affine sum of the factors, or the joint shape itself."""
+    """Whether it learns the difference from the affine sum, or the joint shape."""
     dropout: float = Field(0.0, ge=0, lt=1)
-    """Share of the features that are set to zero after each hidden layer during training."""
+    """Share of features set to zero in training."""
     normalisation: Normalisation = "after"
-    """Batch normalisation in each hidden layer: ``before`` or ``after`` its activation, or ``none``."""
+    """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """Weight of lengths and angles that fit no surface, as in the factor networks."""
+    """As in the factor networks."""
     fit: FitSettings = FitSettings(schedule="cosine", max_epochs=60)
-    """How the network is trained."""
+    """How it is trained."""
 
 
 class FieldSettings(SettingsTable):
-    """A perceptron at every edge, trained by gradient descent. Its inputs are the angles from this edge to the features
-    that codes move over the surface. The collection must know where its features are, as Freaky Torus does.
+    """A perceptron at every edge. Its inputs are angles to the features that codes move over the surface. Only the
+    collection ``freaky-torus`` has such features.
     """
 
     kind: Literal["field"] = "field"
@@ -188,40 +176,35 @@ class FieldSettings(SettingsTable):
     width: int = Field(128, ge=1)
     """Width of each layer."""
     concentrations: list[Annotated[float, Field(gt=0)]] = Field([1, 4, 16, 64])
-    """Concentrations κ of the densities exp(κ (cos r − 1)) of the angle r to a feature. They are inputs, beside the
-    cosine and the sine of r. Narrow features need large values."""
+    """Concentrations κ of the inputs exp(κ (cos r − 1)), where r is the angle to a feature. Narrow features need large
+    values."""
     relative: bool = True
-    """Whether inputs are functions of the angles from an edge to features. The network then need not learn symmetries
-    that move both. If not, inputs are the positions of features and edges."""
+    """Whether inputs depend only on angles to features, so that symmetries need no learning. If not, inputs are
+    positions."""
     edges: int = Field(128, ge=1)
-    """Number of edges of each shape in the loss of a training step. Half of them are drawn in proportion to the squared
-    error of the affine sum."""
+    """Edges of each shape in the loss of a training step. Half are drawn where the affine sum is bad."""
     fit: FitSettings = FitSettings(
         optimiser="muon", schedule="cosine", learning_rate=2e-2, batch_size=64, max_epochs=80
     )
-    """How the network is trained."""
+    """How it is trained."""
 
 
 class PaperSettings(SettingsTable):
-    """The paper's combiner (section 4): convolutions on stars that learn the joint shape itself, with dropout 0.1.
-
-    Adam starts with a learning rate of 1e-3 and divides it by ten on a plateau.
-    """
+    """The paper's combiner (section 4): convolutions on stars that learn the joint shape, with dropout 0.1."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "integrability"})
 
     kind: Literal["paper"] = "paper"
     layers: int = Field(3, ge=1)
-    """Number of successive convolutions."""
+    """Number of convolutions."""
     width: int = Field(24, ge=1)
-    """Number of features of each edge after each layer."""
+    """Features of each edge after each layer."""
     normalisation: Normalisation = "before"
-    """Batch normalisation in each layer: ``before`` or ``after`` its activation, or ``none``. The paper has it after
-    each layer."""
+    """Batch normalisation before or, as in the paper, after the activation of each layer."""
     integrability: float = Field(0, ge=0)
-    """Weight of lengths and angles that fit no surface, which the paper suggests in its outlook."""
+    """As in the factor networks; the paper suggests it."""
     fit: FitSettings = FitSettings()
-    """How the network is trained."""
+    """How it is trained."""
 
     @property
     def convolutions(self) -> ConvolutionSettings:
@@ -231,16 +214,14 @@ class PaperSettings(SettingsTable):
 
 
 class AutoSettings(SettingsTable):
-    """The kind with the smallest error on held-out codes.
-
-    This is ``kernel`` for most collections. If codes move something over the surface, the run tries a second kind:
-    ``field`` if the collection knows where its features are, otherwise ``convolutions``. It chooses the second kind if
-    its error is at least a tenth smaller.
+    """``kernel`` for most collections. If codes move something over the surface, the run also tries ``field`` for
+    ``freaky-torus``, otherwise ``convolutions``. It takes this second kind if its error on held-out codes is at least a
+    tenth smaller.
     """
 
     kind: Literal["auto"] = "auto"
     minutes: float = Field(30, ge=0)
-    """Most minutes of training for the second kind. The run does not try it if the kernel alone took longer."""
+    """Most minutes of training for the second kind. The run skips it if the kernel alone took longer."""
 
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
@@ -261,14 +242,14 @@ _COMBINER_OF_0_1 = {
 
 
 class CombinerSettings(SettingsTable):
-    """The map from J factor shapes to the joint shape: their affine sum, plus a correction."""
+    """The map from factor shapes to the joint shape: their affine sum plus a correction."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"eta"})
 
     correction: CorrectionSettings = AutoSettings()
-    """How the difference between the joint shape and the affine sum is learned."""
+    """How the difference from the affine sum is learned."""
     symmetries: bool = True
-    """Whether the training samples include their images under the collection's symmetries, if it has any."""
+    """Whether samples include their images under the collection's symmetries, if it has any."""
     eta: float | None = Field(None, gt=0)
     """Weight of angles in the loss, as in the factor networks."""
 
@@ -292,29 +273,28 @@ class Recipe(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"fine_tuning"})
 
     factors: list[LatentNetworkSettings] | LatentNetworkSettings = LatentNetworkSettings()
-    """Settings of the factor networks: one table for each factor, or one for all."""
+    """The factor networks: one table for all, or one for each."""
     combiner: CombinerSettings = CombinerSettings()
     """The network that joins the factors' shapes."""
     fine_tuning: FitSettings | None = None
-    """How all networks are trained once more, together, on the joint samples. By default the run trains factors and
-    combiner one after the other. Parts of a combiner that were found in closed form stay."""
+    """How all networks are then trained together on the joint samples. By default not. Parts of a combiner in closed
+    form stay."""
 
 
 class NetworkSettings(Recipe):
-    """The networks that are exported, and those that are trained for comparison."""
+    """The networks that are exported, and networks for comparison."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = Recipe.SINCE_0_3 | {"device"}
 
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Where networks are trained by gradient descent: on the processor, on an NVIDIA or AMD GPU (``cuda``), or on the
-    GPU of an Apple computer (``mps``). ``auto`` takes a GPU if PyTorch finds one. See [how to train on a
-    GPU](../how-to/gpu.md). If you change only the device, finished networks stay."""
+    """Where gradient descent runs: processor, NVIDIA or AMD GPU (``cuda``), or GPU of an Apple computer (``mps``).
+    ``auto`` takes [a GPU](../how-to/gpu.md) if there is one. A change of it alone keeps finished networks."""
     seed: int = 0
-    """Seed of the networks' initial weights and of the order of the samples."""
+    """Seed of initial weights and of the order of samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])
     """Not used any more. Version 0.2 trained with these shares of the training codes too; ``python -m
     benchmarks.studies`` does so now."""
     seeds: list[int] = Field([])
     """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
     paper: bool = False
-    """Whether the run also trains the paper's own system, for comparison. This takes hours on a processor."""
+    """Whether to train the paper's own system too, for comparison: hours on a processor."""

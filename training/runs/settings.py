@@ -51,29 +51,26 @@ class CollectionSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
-    """Built-in generator that makes the shapes. ``expressive`` is a body in 149 poses: 100 with moving hands and face,
-    49 with moving limbs. ``people`` is 24 bodies in 14 poses each. Both need ``pip install
-    'shapespace[train,people]'``. Give either ``generator`` or ``data``."""
+    """Built-in generator, instead of ``data``. ``expressive`` is a body: 100 poses of hands and face, 49 of limbs.
+    ``people`` is 24 bodies in 14 poses each. Both need the extra ``people``."""
     data: Path | None = None
-    """Folder of OBJ, PLY, STL, OFF, glTF or VTK files, or one NPZ file with ``vertices`` (n, V, 3) and ``faces``, or
-    one GLB or glTF file whose morph targets are the shapes. The path is relative to the configuration's folder. The
-    command's ``--data`` takes precedence."""
+    """Folder of meshes, NPZ file with ``vertices`` (n, V, 3) and ``faces``, or GLB or glTF file with [morph
+    targets](files.md#morph-targets-as-a-collection). The path is relative to the configuration's folder. ``--data``
+    overrides it."""
     file: str | None = None
-    """Name of the file to read from each folder in ``data``, if every subject has a folder. It may be a path, such as
-    ``surf/pial.ply``, and have ``*`` and ``?`` in it, as in ``*_mesh.ply``. Shapes have the names of the folders."""
+    """File to read from each folder in ``data``, if every subject has a folder: ``surf/pial.ply`` or ``*_mesh.ply``.
+    Shapes get the folders' names."""
     reference: str | None = None
-    """Name of the reference mesh, which gives served shapes their position and orientation. By default it is the most
-    central mesh."""
+    """Name of the [reference](glossary.md#reference). By default the most central mesh."""
     parts: list[str] = []
-    """Names of the parts to keep, for meshes of several parts. The model predicts the first part and attaches the
-    others to it. By default it keeps all parts, and predicts the largest. Parts have the names of the file's objects,
-    groups or materials, or ``part 1``, ``part 2`` and so on. ``run --until ingest`` prints the names."""
+    """[Parts](files.md#several-parts) to keep, the main part first. By default all, with the largest as the main part.
+    ``run --until ingest`` prints their names."""
     coarse_vertices: int = Field(1000, ge=0)
-    """Vertices to compute with: meshes with more than 1.5 times this number are simplified to about this number. 0
-    computes with all vertices."""
+    """Number of vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with
+    all."""
     mirror: bool = True
-    """Whether to learn from the shapes' mirror images too. A pose of the left arm is then also a pose of the right arm.
-    One of the shapes must have exactly one plane of symmetry, to pair each vertex with its mirror image."""
+    """Whether to learn from [mirror images](glossary.md#mirror-image) too, if one of the shapes has exactly one plane
+    of symmetry."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -83,68 +80,62 @@ class CollectionSettings(SettingsTable):
 
 
 class MaterialSettings(SettingsTable):
-    """Elastic parameters of the surface, which is treated as a thin shell. The reference is scaled to area 1."""
+    """Elastic parameters of the surface, a thin shell. The reference is scaled to area 1."""
 
     mu: float = Field(Material.mu, gt=0)
     """Lamé's μ of the membrane."""
     lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
     """Lamé's λ of the membrane."""
     eta: float = Field(Material.eta, gt=0)
-    """Weight η of bending against stretching, about the squared thickness of the shell, where the reference has area 1.
-    Triangles may collapse if it is large."""
+    """Weight η of bending against stretching, about the squared thickness of the shell. Triangles may collapse if it is
+    large."""
 
 
 class ExponentialSettings(SettingsTable):
     """The discrete exponential, which makes a shape from a code in K time steps."""
 
     first_step: FirstStep = "centred"
-    """The first of the K steps. ``centred`` adds the acceleration, for the price of one step more. With ``paper`` the
-    error falls only like 1/K. Codes mean other shapes with each. A run directory of version 0.2 keeps ``paper`` by
-    default."""
+    """The first of the K steps; codes mean other shapes with each. ``centred`` costs one more step. With ``paper`` the
+    error falls only like 1/K. Runs of version 0.2 keep ``paper``."""
 
 
 class ModeSettings(SettingsTable):
-    """The modes: the directions in which shapes differ from their mean, found by sparse principal geodesic analysis."""
+    """The modes: the directions in which shapes differ from their mean."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of modes m, at most one less than the number of shapes. ``auto`` minimises the error of held-out shapes,
-    as a share of their distance from the mean shape, plus half a percent for each mode."""
+    """Number of modes m, less than the number of shapes. ``auto`` minimises the relative error of held-out shapes plus
+    0.5 % for each mode."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
-    """The map from codes to shapes; ``init`` writes ``auto``. ``vertices`` moves every vertex along a straight line, so
-    modes add up like blend shapes. ``nric`` does the same with lengths and angles, so limbs can bend. ``differential``
-    does it with rotations and stretches of faces, so limbs can turn far. ``exponential`` bends the surface as an
-    elastic shell. Straight lines are found in minutes: they have dense modes, one factor, and need neither ``norm``,
-    ``sparsity`` nor samples to learn from. ``auto`` takes the cheapest of the four whose error on held-out shapes is at
-    most 2 % above the least, or 5 % above exponentials."""
+    """The map from codes to shapes; ``init`` writes ``auto``. Straight lines: ``vertices`` like blend shapes, ``nric``
+    (lengths and angles) so that limbs bend, ``differential`` (rotations and stretches of faces) so that they turn far.
+    They take minutes, have dense modes and one factor, and need neither ``norm``, ``sparsity`` nor samples.
+    ``exponential`` bends an elastic shell. ``auto`` takes the cheapest map whose error on held-out shapes is at most 2
+    % above the least, or 5 % above exponentials."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
-    """The norm in which modes approximate the shapes. ``vertices`` takes distances of vertices, weighted by area.
-    ``shell`` is the metric of the shell space, which gives small wrinkles much weight. ``mixed`` is ``vertices`` plus a
-    tenth of ``shell``."""
+    """Norm in which modes approximate shapes. ``vertices``: distances, weighted by area. ``shell``: the metric of the
+    shell space, with much weight on wrinkles. ``mixed``: ``vertices`` plus a tenth of ``shell``."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
-    """Weight λ of the sparsity term, as a share of the weight at which every mode would vanish. Larger values make each
-    mode move a smaller part; 0 is plain principal geodesic analysis. ``auto`` takes the largest of some candidates that
-    increases the error of held-out shapes by at most 2 %, and 0 if none does."""
+    """Weight λ of sparsity, as a share of the weight at which modes vanish. Larger values make each mode move a smaller
+    part. ``auto`` takes the largest candidate that raises the error of held-out shapes by at most 2 %, or else 0."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number K of time steps of the discrete logarithms. With one step, modes move vertices along straight lines and
-    add up like blend shapes. With many, modes bend the surface. ``auto`` takes 8 (16 with the paper's first step), or 1
-    if that does not raise the error of held-out shapes and at most a tenth of random shapes fold."""
+    """Number K of [time steps](glossary.md#time-steps) of logarithms. ``auto`` takes 8 (16 with the paper's first
+    step). It takes 1 if held-out shapes get no worse and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
-    """Most iterations of the sparse analysis, each over all modes."""
+    """Most iterations over all modes."""
 
 
 class FactorSettings(SettingsTable):
-    """The factors: groups of modes that move the same part of the surface. Each factor has a network of its own."""
+    """The factors: groups of modes that move the same part of the surface."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"modes"})
 
     count: int | None = Field(None, ge=1)
-    """Number of factors J. By default it follows from the overlap of the modes."""
+    """Number of factors J. By default the overlap of the modes decides."""
     modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
-    """The factors, if you choose them yourself: the modes of each factor, such as ``[[0, 3], [1], [2, 4]]``. Modes are
-    counted from 0, the strongest first. Every mode has to be in exactly one factor. Set ``modes.count`` too, so that
-    their number is known. By default, modes that move the same part form a factor."""
+    """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``. Modes are counted from 0, the strongest
+    first, each in exactly one factor. Set ``modes.count`` too."""
 
     @model_validator(mode="after")
     def _each_mode_once(self) -> FactorSettings:
@@ -159,39 +150,34 @@ class FactorSettings(SettingsTable):
 
 
 class SampleSettings(SettingsTable):
-    """The samples to learn from: shapes of random codes, and of the collection's own codes."""
+    """Shapes of codes, from which networks learn."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"distribution"})
 
     distribution: Distribution = "box"
-    """How random codes are drawn. ``box`` is uniform within the bounds. ``ball`` is uniform, in each factor, in the
-    ellipsoid that touches the bounds, so it leaves out the corners, where shapes fold most. ``normal`` is normal,
-    truncated at the bounds, with half of the distance from the middle to the bounds as standard deviation. Periodic
-    coordinates are always uniform."""
+    """How random codes are drawn. ``box``: uniform within the bounds. ``ball``: uniform in each factor's largest
+    ellipsoid inside the bounds, so without the corners, where shapes fold most. ``normal``: normal, truncated at the
+    bounds, which lie two standard deviations from the middle. Periodic coordinates are always uniform."""
     count: int = Field(4000, ge=10)
-    """Number of joint samples: shapes of random codes. They take most of a run's time. 500 are enough for a first
-    look."""
+    """Number of joint samples, which take most of a run's time. 500 are enough for a first look."""
     steps: int | None = Field(None, ge=1)
-    """Number K of time steps of the discrete exponentials. By default it is ``modes.log_steps``. If that is ``auto``
-    and the first step is centred, it is the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps is
-    at most 1e-5."""
+    """Number K of [time steps](glossary.md#time-steps) of exponentials, ``modes.log_steps`` by default. If that is
+    ``auto`` and the first step is centred: the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps
+    is at most 1e-5."""
     factor_counts: list[int] | int | None = None
-    """Number of samples of each factor alone: one number for all factors, or one for each. Their codes are the factor's
-    part of the joint codes, and of further codes beyond ``count``. By default 1000, but at most ``count``."""
+    """Number of samples of each factor alone: one for all factors, or a list. By default 1000, but at most
+    ``count``."""
     shapes: bool = True
-    """Whether the codes of the collection's own shapes are training samples too. Few random codes lie near these
-    shapes. Their number is at most a quarter of ``count``, spread evenly over the shapes."""
+    """Whether the codes of the collection's own shapes are training samples too, at most a quarter of ``count``."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples with derivatives by the code, which the networks learn too. Such a sample takes as long
-    as about ten others. It helps more than ten others if there are only a few hundred. By default 60, but at most a
-    tenth of ``count``."""
+    """Number of joint samples with derivatives by the code. Each takes as long as about ten others, and helps more if
+    there are only a few hundred. By default 60, but at most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
-    """Number of samples per file, and ten times the number of derivatives. A worker computes one file at a time, and
-    loses it if it dies."""
+    """Samples per file. A worker computes one file at a time, and loses it if it dies."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
-    """Share of the joint samples that are used for the evaluation only."""
+    """Share of the joint samples for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Share of the remaining joint samples that are used to choose the learning rate and the best epoch."""
+    """Share of the remaining samples that choose the learning rate and the best epoch."""
     seed: int = 0
     """Seed of the random codes and of their split."""
 
@@ -218,22 +204,21 @@ class EvaluationSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"baselines"})
 
     eta: float = Field(1e-2, gt=0)
-    """Weight of angles against lengths in the norm of all figures."""
+    """Weight of angles against lengths in all figures."""
     baselines: bool = False
-    """Whether the run also trains networks with one factor, ``monolithic`` and ``monolithic_paper``, for comparison.
-    This about doubles the time of the stage ``networks``."""
+    """Whether to train ``monolithic`` and ``monolithic_paper`` too, networks with one factor. This about doubles the
+    time of the stage ``networks``."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
-    """Most nodes per coordinate of the multilinear grid of Sassen et al. 2020, for comparison. It may take as long as
-    all samples. 0 leaves it out. Needs ``baselines``."""
+    """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 leaves it out. It may take as long
+    as all samples. Needs ``baselines``."""
     grid_size: int = Field(1000, ge=1)
-    """Most nodes of the grid of one factor. A factor gets no grid if this leaves fewer than 3 nodes per coordinate."""
+    """Most nodes of one factor's grid. A factor with fewer than 3 nodes per coordinate gets none."""
     exact_factors: int = Field(200, ge=2)
-    """Number of test codes for which the affine sum of exact factor shapes is computed, for comparison."""
+    """Number of test codes for the affine sum of exact factor shapes."""
     reconstructions: int = Field(100, ge=1)
     """Number of test shapes whose vertices are reconstructed."""
     fresh: int = Field(100, ge=0)
-    """Number of fresh codes on which every model is measured once more, at most the number of test codes. They are
-    drawn after training, with a digest of the networks as seed. 0 leaves this out."""
+    """Number of [fresh codes](glossary.md#fresh-codes), at most the number of test codes; 0 for none."""
 
 
 #: An axis of the collection's coordinates, with its direction.
@@ -241,38 +226,37 @@ Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
 class ExportSettings(SettingsTable):
-    """Name and description of the exported bundle."""
+    """The exported bundle."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"decoder"})
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
-    """Name of the model in addresses and file names."""
+    """Name in addresses and file names."""
     version: int = Field(1, ge=1, lt=10**9)
-    """Version of the bundle, which is written to ``models/NAME/VERSION``. A bundle with this version is replaced."""
+    """The bundle is written to ``models/NAME/VERSION``, and replaces one with this version."""
     title: str
-    """Title of the model, shown to people."""
+    """Title for people."""
     description: str
-    """A sentence that describes the model, shown to people."""
+    """A sentence for people."""
     licence: str
     """Licence of the meshes, and so of the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
-    """Weight η of angles against lengths when Gauss–Newton finds the vertices."""
+    """Weight of angles against lengths in [Gauss–Newton](glossary.md#gaussnewton)."""
     examples: bool = True
-    """Whether the bundle stores the errors of modes and networks at the training shapes, and corrects them at the codes
-    of these shapes. Other codes change very little. The bundle grows by a byte for each length and angle of each
-    shape."""
+    """Whether the model [remembers](glossary.md#remembers) training shapes. Each takes a byte for each of its lengths
+    and angles."""
     decoder: bool = True
-    """Whether the bundle has ``decoder.onnx``, one graph from codes to vertices for other programs than the server."""
+    """Whether to write [``decoder.onnx``](bundle.md#the-decoder) for other programs."""
     tolerance: float = Field(1e-4, gt=0)
-    """Largest allowed relative difference between the ONNX and the PyTorch networks, in the weighted norm."""
+    """Largest relative difference between the ONNX and the PyTorch networks."""
     faces: Axis | None = None
-    """The axis along which the body looks. Left and right in names are then the body's own. By default they are the
-    left and right of a viewer who has x to the right, y up and z towards the eye."""
+    """The axis along which the body looks: left and right in names are then its own. By default they are a viewer's
+    with x to the right, y up and z towards the eye."""
     up: Axis = "+y"
-    """The axis that points to the body's head. Only used with ``faces``."""
+    """The axis that points to the body's head. Needs ``faces``."""
     names: dict[str, str] = {}
-    """New names of factors and coordinates, by the name in the report: ``{"upper right" = "left arm"}``. Coordinates
-    follow their factor unless they are named themselves."""
+    """New names by the name in the report: ``{"upper right" = "left arm"}``. Coordinates follow their factor unless
+    they have names of their own here."""
 
     @property
     def key(self) -> dict[str, Any]:
