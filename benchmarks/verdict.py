@@ -206,6 +206,7 @@ def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
         ratios_of=lambda some, name: listed([f"{each.ratios[name]:.2f}" for each in some]),
         beaten=beaten,
         cost=cost_of_fewer_shapes(runs),
+        measured=pages.measured_with(*(runs / "collections" / f"{name}.json" for name in by_name)),
         ratio_of=lambda name: f"{by_name[name].ratio:.2f}",
         fewer={"whole": by_name["samba"], "half": collection("samba" + HALF, runs)},
         images=WITH_IMAGES,

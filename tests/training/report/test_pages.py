@@ -79,7 +79,7 @@ def test_a_simple_model_that_is_measured_later_is_in_the_verdict(tmp_path: Path)
             fold["unseen"][rival] = {key: share * value for key, value in fold["unseen"]["components"].items()}
     pages.write_figures(file, folds)
     found = verdict.collections(tmp_path)
-    said = "For hands, a better simple model is: linear skinning. Its error is 0.25 of the error of plain components"
+    said = "**A better simple model** for hands: linear skinning. Its error is 0.25 of the error of plain components"
     assert said in verdict.page(found, tmp_path)
     chart = tmp_path / "chart.svg"
     verdict.draw(found, chart)
