@@ -113,13 +113,14 @@ def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
         ({"targets": [target | {"weight": 2}]}, "Remove 'targets[0].weight'"),
         ({"prior": -1}, "at least 0"),
         ({"prior_kind": "lasso"}, "'groups' or 'ridge'"),
-        ({"targets": [target | {"sigma": 0}]}, "targets[0].sigma"),
+        ({"targets": [target | {"sigma": 0}]}, "number above 0 for targets[0].sigma"),
         ({"fixed": {"3": 0}}, "coordinates 0 to 2"),
         ({"fixed": {"-1": 0}}, "'-1' is not an index"),
         ({"fixed": {"0": None}}, "the value at 0 is not a finite number"),
         ({"fixed": [0]}, "fixed"),
         ({"samples": 21}, "the limit is 20"),
         ({"seed": -1}, "at least 0"),
+        ({"seed": 2**64}, "number of at most"),
     ):
         answer = client.post(EDIT, json={"latent": CODE, "targets": [target]} | change)
         assert answer.status_code == 422, answer.text
