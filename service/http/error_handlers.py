@@ -154,6 +154,7 @@ _ADVICE = {
     "greater_than": "Send a number above {gt:g} for {name}.",
     "greater_than_equal": "Send a number of at least {ge:g} for {name}.",
     "less_than_equal": "Send a number of at most {le} for {name}.",
+    "less_than": "Send a number below {lt} for {name}.",
     "value_error": "Correct {name}: {error}.",
     **dict.fromkeys(("float_type", "float_parsing"), "Send a number for {name}."),
     **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "Send a whole number for {name}."),

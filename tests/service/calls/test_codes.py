@@ -120,7 +120,7 @@ def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
         ({"fixed": [0]}, "fixed"),
         ({"samples": 21}, "the limit is 20"),
         ({"seed": -1}, "at least 0"),
-        ({"seed": 2**64}, "number of at most"),
+        ({"seed": 2**64}, "number below 9223372036854775808 for seed"),
     ):
         answer = client.post(EDIT, json={"latent": CODE, "targets": [target]} | change)
         assert answer.status_code == 422, answer.text
