@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
 from http import HTTPStatus
@@ -119,7 +120,7 @@ def _allowed(request: Request) -> list[str]:
 
 async def _validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101 - as above
-    faults = error.errors()
+    faults = [{**fault, "loc": _place(fault)} for fault in error.errors()]
     if any(fault["type"] == "json_invalid" for fault in faults):
         place = f"character {faults[0]['loc'][-1]}: {faults[0].get('ctx', {}).get('error', '')}"
         detail = f"The body is not JSON ({place}). Send one valid JSON object."
@@ -134,13 +135,26 @@ async def _validation(request: Request, error: Exception) -> Response:
     return problem(request.scope, kind, errors[0]["detail"] + more, errors=errors)
 
 
+def _place(fault: Mapping[str, Any]) -> tuple[str | int, ...]:
+    """Return the members and indices that lead to a fault, without names of types such as ``list[float]``."""
+    *way, last = fault["loc"]
+    ends = [last] if fault["type"] == "extra_forbidden" or not _TYPE.fullmatch(str(last)) else []
+    return tuple(part for part in way if not _TYPE.fullmatch(str(part))) + tuple(ends)
+
+
+#: Name of a type in the place of a fault.
+_TYPE = re.compile(r"[a-z-]+\[.*\]")
 #: How to correct a fault that pydantic found, by its type.
 _ADVICE = {
     "extra_forbidden": "Remove {name!r}: there is no such field. /openapi.json lists all fields.",
     "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
     "list_type": "Send a list for {name}.",
-    "too_short": "Send at least {min_length} entries for {name}, not {actual_length}.",
-    "greater_than_equal": "Send a number of at least {ge} for {name}.",
+    "too_short": "Send {min_length} or more entries for {name}, not {actual_length}.",
+    "too_long": "Send {max_length} or fewer entries for {name}, not {actual_length}.",
+    "greater_than": "Send a number above {gt:g} for {name}.",
+    "greater_than_equal": "Send a number of at least {ge:g} for {name}.",
+    "less_than_equal": "Send a number of at most {le} for {name}.",
+    "less_than": "Send a number below {lt} for {name}.",
     "value_error": "Correct {name}: {error}.",
     **dict.fromkeys(("float_type", "float_parsing"), "Send a number for {name}."),
     **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "Send a whole number for {name}."),

@@ -17,7 +17,7 @@ import numpy as np
 from python_multipart.multipart import parse_options_header
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.archives import natural_order, seekable
+from shapespace.files.archives import Place, natural_order, seekable
 from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.recognition import Assumed, FormatError, decide
@@ -158,11 +158,14 @@ def _looks_otherwise(data: memoryview, assumed: Assumed) -> str:
     return f"; it looks like {found.name}" if found.name != assumed.name else ""
 
 
-def _read(data: memoryview, format: str, limits: Limits, *, points: bool, name: str = "") -> UploadedMesh:
+def _read(
+    data: memoryview, format: str, limits: Limits, *, points: bool, name: str = "", beside: Place | None = None
+) -> UploadedMesh:
     if format in VTK_FORMATS and not vtk_loaded():
         raise_memory_limit(_VTK_MEMORY)
-    found = _read_json(data, limits) if format == "json" else read_arrays(data, format, limits, points=points)
-    return UploadedMesh(*_checked(*found), name)
+    if format == "json":
+        return UploadedMesh(*_checked(*_read_json(data, limits)), name)
+    return UploadedMesh(*_checked(*read_arrays(data, format, limits, points=points, beside=beside)), name)
 
 
 def _read_archive(data: memoryview, limits: Limits, *, points: bool, most: int) -> list[UploadedMesh]:
@@ -197,14 +200,15 @@ def _read_member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, limits: Limit
     content, name = archive.read(entry), label(entry.filename) or ""
     try:
         format = decide(memoryview(content), SCAN_FORMATS if points else READ_FORMATS, entry.filename).name
-        return _read(memoryview(content), format, limits, points=points, name=name)
+        beside = zipfile.Path(archive, entry.filename)
+        return _read(memoryview(content), format, limits, points=points, name=name, beside=beside)
     except MeshError as error:
         raise MeshError(f"{name}: {error}") from None
 
 
 def _hidden(name: str) -> bool:
     """Whether a member of an archive is hidden. macOS adds such members."""
-    return any(part.startswith((".", "__MACOSX")) for part in name.split("/"))
+    return any(part.startswith((".", "__MACOSX")) for part in name.split("/") if part not in (".", ".."))
 
 
 def _extension(name: str) -> str:

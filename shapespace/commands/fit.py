@@ -24,8 +24,10 @@ from shapespace.commands.parameters import (
     require_new,
     write,
 )
+from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.options import FitOptions
+from shapespace.model.scan import InvalidScanError
 from shapespace.model.shape_model import load
 from shapespace.solve.deadline import Deadline
 
@@ -61,7 +63,10 @@ def fit(
     format = format_of(out) if out else ""
     loaded = load(model)
     limit = None if deadline is None else Deadline(seconds=deadline)
-    found = loaded.fit_scan(scan, chosen(FitOptions, parameters), deadline=limit)
+    try:
+        found = loaded.fit_scan(scan, chosen(FitOptions, parameters), deadline=limit)
+    except (MeshError, InvalidScanError) as error:
+        raise MeshError(f"{scan}: {error}") from None
     if out:
         mesh, surface = loaded.mesh(), loaded.decoder.surface(MeshChoice.FINE)
         write(out, FORMATS[format].encode(found.placement(found.shape.vertices), mesh.faces, None, surface))

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import IO, cast
 
 Buffer = bytes | bytearray | memoryview
+#: Place of a file: in a folder, or in an open archive.
+Place = Path | zipfile.Path
 #: What an archive can be read from.
 Source = Path | bytes | memoryview
 #: Compression level of zlib. Higher levels take longer than computing the shapes, and save a tenth of the size.

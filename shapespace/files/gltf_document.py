@@ -12,13 +12,14 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, cast
 from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
+from shapespace.files.archives import Place
 from shapespace.files.limits import clipped
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -36,7 +37,7 @@ _LARGEST_STRIDE = 252
 _DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
 
 
-def read_document(data: memoryview, *, binary: bool, beside: Path | None) -> tuple[GltfDocument, Buffers]:
+def read_document(data: memoryview, *, binary: bool, beside: Place | None) -> tuple[GltfDocument, Buffers]:
     """Return the JSON of a file and its buffers, see `gltf_reading.open_scene`."""
     text, chunk = _chunks(data) if binary else (data, None)
     tree, uris = _parse(text)
@@ -193,7 +194,9 @@ def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def entry_at(entries: list[dict[str, Any]], index: object) -> dict[str, Any]:
-    """Return the entry at an index; raises ValueError or IndexError if it is not an index of an entry."""
+    """Return the entry at an index; raises ValueError if it is not an index of an entry."""
+    if _natural(index) >= len(entries):
+        raise ValueError(f"it refers to entry {clipped(index)} of a list that has {len(entries)}, counted from 0")
     return entries[_natural(index)]
 
 
@@ -334,9 +337,9 @@ class Buffers:
     """
 
     def __init__(
-        self, entries: list[dict[str, Any]], chunk: memoryview | None, uris: list[memoryview], beside: Path | None
+        self, entries: list[dict[str, Any]], chunk: memoryview | None, uris: list[memoryview], beside: Place | None
     ) -> None:
-        self._sources: list[memoryview | Path | None] = []
+        self._sources: list[memoryview | Place | None] = []
         self._encoded, self._uris = set[int](), uris
         for k, entry in enumerate(entries):
             uri = entry.get("uri")
@@ -362,7 +365,7 @@ class Buffers:
         content: bytes | memoryview
         if source is None:
             raise ValueError(f"its buffer {index} has no data")
-        if isinstance(source, Path):
+        if isinstance(source, Place):
             with source.open("rb") as file:
                 file.seek(start)
                 content = file.read(stop - start)
@@ -377,9 +380,11 @@ class Buffers:
         return content
 
 
-def _beside(name: str, path: Path | None) -> Path:
+def _beside(name: str, path: Place | None) -> Place:
     """Return the path of a file in the folder of ``path`` or below; raises ValueError if there is none."""
     inside = PurePosixPath(name)
-    if path is None or inside.is_absolute() or ".." in inside.parts or not (path.parent / inside).is_file():
-        raise ValueError(f"it needs {clipped(name)}, which is not beside it")
-    return path.parent / inside
+    if path is not None and not inside.is_absolute() and ".." not in inside.parts:
+        found = cast("Place", path.parent).joinpath(str(inside))
+        if found.is_file():
+            return found
+    raise ValueError(f"it needs {clipped(name)}, which is not beside it")

@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.files.archives import Place
 from shapespace.files.gltf_document import (
     Accessor,
     Buffers,
@@ -44,7 +44,7 @@ _JOINTS, _WEIGHTS = (5121, 5123), (5121, 5123, 5126)
 
 
 def read_gltf(
-    data: memoryview, limits: Limits, *, binary: bool, beside: Path | None = None
+    data: memoryview, limits: Limits, *, binary: bool, beside: Place | None = None
 ) -> tuple[FloatArray, IntArray]:
     """Return vertices (V, 3) and faces (F, 3) of the default scene; arguments and errors as for `open_scene`.
 
@@ -55,7 +55,7 @@ def read_gltf(
     return scene.vertices, scene.faces
 
 
-def open_scene(data: memoryview, limits: Limits, *, binary: bool, beside: Path | None = None) -> Scene:
+def open_scene(data: memoryview, limits: Limits, *, binary: bool, beside: Place | None = None) -> Scene:
     """Return the default scene of a file.
 
     Args:
@@ -87,7 +87,7 @@ class MorphShapes:
     faces: IntArray
 
 
-def read_morph_shapes(data: memoryview, *, binary: bool, beside: Path | None = None) -> MorphShapes:
+def read_morph_shapes(data: memoryview, *, binary: bool, beside: Place | None = None) -> MorphShapes:
     """Return the shapes of a file whose morph targets are shapes; arguments and errors as for `open_scene`.
 
     A target has the name that ``extras.targetNames`` of its mesh gives it, or else "target 1" and so on. Targets of

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapespace.files.archives import Place
 from shapespace.files.gltf_reading import MorphShapes, read_gltf, read_morph_shapes
 from shapespace.files.limits import UNLIMITED, Limits, reason
 from shapespace.files.npz import read_mesh_npz
@@ -55,6 +56,7 @@ def read_arrays(
     limits: Limits = UNLIMITED,
     *,
     points: bool = False,
+    beside: Place | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""Read one mesh as it is in its file: vertices (V, 3) and faces (F, 3), nothing merged and nothing checked.
 
@@ -68,6 +70,7 @@ def read_arrays(
         format: one of READ_FORMATS; by default the first bytes decide, then the extension of the path.
         limits: largest numbers of vertices and faces. A larger mesh is refused.
         points: whether points without faces are accepted. The format can then be one of SCAN_FORMATS.
+        beside: place of the content, if it is not given as a path: the buffers of a glTF file lie there.
 
     Raises:
         MeshError: the file is unreadable, too large, or doesn't hold exactly one mesh.
@@ -77,7 +80,7 @@ def read_arrays(
     >>> vertices.shape, faces.tolist()
     ((3, 3), [[0, 1, 2]])
     """
-    beside = source if isinstance(source, Path) else None
+    beside = source if isinstance(source, Path) else beside
     if isinstance(source, Path):
         source = _content(source)
     data = memoryview(source)
@@ -123,7 +126,7 @@ def _refusing(format: str) -> Iterator[None]:
 
 
 def _read(
-    data: memoryview, format: str, limits: Limits, *, points: bool, beside: Path | None
+    data: memoryview, format: str, limits: Limits, *, points: bool, beside: Place | None
 ) -> tuple[np.ndarray, np.ndarray]:
     match format:
         case "glb" | "gltf":
@@ -143,7 +146,7 @@ def _read(
             raise FormatError(f"not a readable {format} file: there is no such format; these can be read: {known}")
 
 
-def _decided(data: memoryview, formats: Iterable[str], path: Path | None) -> str:
+def _decided(data: memoryview, formats: Iterable[str], path: Place | None) -> str:
     """Return the format of a file that names none; raises FormatError with the formats that can be read."""
     try:
         return decide(data, [*formats], path.name if path else "").name

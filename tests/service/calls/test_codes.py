@@ -103,23 +103,24 @@ def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
     target = {"vertex": 0, "position": [0, 0, 0]}
     for change, says in (
         ({"latent": [0, 0]}, "Send exactly 3"),
-        ({"targets": []}, "at least 1 entries for targets"),
+        ({"targets": []}, "1 or more entries for targets"),
         ({"targets": [target, target | {"vertex": 512}]}, "targets[1].vertex is 512, but the fine mesh has"),
         ({"targets": [target | {"vertex": 64}], "mesh": "coarse"}, "vertices 0 to 63"),
         ({"targets": [target | {"vertex": -1}]}, "vertex is -1"),
         ({"targets": [target | {"vertex": 0.5}]}, "whole number"),
-        ({"targets": [target | {"position": [0, 0]}]}, "at least 3"),
+        ({"targets": [target | {"position": [0, 0]}]}, "3 or more entries"),
         ({"targets": [target | {"position": [0, 0, 1e300]}]}, "Send finite positions"),
         ({"targets": [target | {"weight": 2}]}, "Remove 'targets[0].weight'"),
         ({"prior": -1}, "at least 0"),
         ({"prior_kind": "lasso"}, "'groups' or 'ridge'"),
-        ({"targets": [target | {"sigma": 0}]}, "targets[0].sigma"),
+        ({"targets": [target | {"sigma": 0}]}, "number above 0 for targets[0].sigma"),
         ({"fixed": {"3": 0}}, "coordinates 0 to 2"),
         ({"fixed": {"-1": 0}}, "'-1' is not an index"),
         ({"fixed": {"0": None}}, "the value at 0 is not a finite number"),
         ({"fixed": [0]}, "fixed"),
         ({"samples": 21}, "the limit is 20"),
         ({"seed": -1}, "at least 0"),
+        ({"seed": 2**64}, "number below 9223372036854775808 for seed"),
     ):
         answer = client.post(EDIT, json={"latent": CODE, "targets": [target]} | change)
         assert answer.status_code == 422, answer.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import io
 import json
@@ -174,6 +175,24 @@ def test_points_are_no_mesh(client: httpx.Client) -> None:
     answer = client.post(ENCODE, content=in_millimetres(), headers={"Content-Type": "text/plain"})
     assert answer.status_code == 415
     assert "has points and no faces" in answer.json()["detail"]
+
+
+def test_a_zip_may_hold_a_gltf_file_and_its_buffer(client: httpx.Client) -> None:
+    """Whole scenes are downloaded like this. Names may start with ./ in archives of some programs."""
+    tree = json.loads(MESH_FORMATS["gltf"].encode(SCALE * MESH.vertices, MESH.faces))
+    data = base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
+    tree["buffers"][0]["uri"] = "data/scene%201.bin"
+    for folder in ("", "./", "scene/"):
+        content = io.BytesIO()
+        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(f"{folder}scene.gltf", json.dumps(tree))
+            archive.writestr(f"{folder}data/scene 1.bin", data)
+        assert found(client.post(ENCODE, content=content.getvalue()))["status"] == "converged"
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("a/scene.gltf", json.dumps(tree).replace("data/", "../data/"))
+        archive.writestr("data/scene 1.bin", data)
+    assert "which is not beside it" in client.post(ENCODE, content=content.getvalue()).json()["detail"]
 
 
 def zipped(**files: bytes) -> bytes:

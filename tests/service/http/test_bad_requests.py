@@ -75,7 +75,7 @@ REQUESTS = {
     "too many codes": post(VERTICES, {"latents": [OK] * 21}, 422, "too-many-codes", "Send several requests"),
     "too many codes for NRIC": post(NRIC, {"latents": [OK] * 21}, 422, "too-many-codes", "the limit is 20"),
     "factors as text": post(NRIC, {"latents": [OK], "factors": "yes"}, 422, "invalid-request", "true or false"),
-    "one keyframe": post(PATHS, {"keyframes": [OK]}, 422, "invalid-request", "at least 2 entries for keyframes"),
+    "one keyframe": post(PATHS, {"keyframes": [OK]}, 422, "invalid-request", "2 or more entries for keyframes"),
     "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
     "times run back": post(
         PATHS, {"keyframes": [OK, OK, OK], "times": [0, 2, 1]}, 422, "invalid-request", "times must increase"

@@ -202,7 +202,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("encode small a.ply --fixed {", 2, "--fixed"),
         ("encode small a.ply --samples 3", 2, "No such option"),
         ("encode small a.ply --fixed {\"7\":0}", 1, "fixed names coordinate 7"),
-        ("fit small none.ply", 1, "can't be read"),
+        ("fit small none.ply", 1, "none.ply: can't be read"),
         ("fit small none.ply --noise 0", 2, "--noise"),
         ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "position"),
         ("fit small none.ply --out", 2, "requires an argument"),
