@@ -37,7 +37,7 @@ description = "Hands in many poses."
 licence = "CC0-1.0"
 
 [export.names]               # new names of factors
-"upper right" = "thumb"
+"upper right bends" = "thumb"
 ```
 
 A setting marked *required* has to be there. The run refuses unknown settings. A dotted heading such as

@@ -271,8 +271,8 @@ class ExportSettings(SettingsTable):
     up: Axis = "+y"
     """The axis that points to the body's head. Only used with ``faces``."""
     names: dict[str, str] = {}
-    """New names of factors and coordinates, by the name in the report: ``{"upper right" = "left arm"}``. Coordinates
-    follow their factor unless they are named themselves."""
+    """New names of factors and coordinates, by the name in the report: ``{"upper right bends" = "left arm"}``.
+    Coordinates follow their factor unless they are named themselves."""
 
     @property
     def key(self) -> dict[str, Any]:
