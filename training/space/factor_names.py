@@ -72,10 +72,11 @@ def names(
             for k, words in zip(alike, _told_apart(values, list(range(count))), strict=True):
                 found[k] = (*sorted((*words, *name[:-1]), key=ORDER.index), name[-1])
     seen: Counter[str] = Counter()
-    result = []
-    for name in map(" ".join, found):
-        seen[name] += 1
-        result.append(name if seen[name] == 1 else f"{name} {seen[name]}")
+    result: list[str] = []
+    for words in found:
+        said = " ".join(words)
+        seen[said] += 1
+        result.append(said if seen[said] == 1 else f"{said} {seen[said]}")
     return result
 
 
