@@ -37,7 +37,7 @@ description = "Hands in many poses."
 licence = "CC0-1.0"
 
 [export.names]               # new names of factors
-"upper right" = "thumb"
+"upper right bends" = "thumb"
 ```
 
 The run refuses unknown settings. A dotted heading such as `networks.factors` is a table `[networks.factors]`. Words

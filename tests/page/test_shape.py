@@ -1,11 +1,14 @@
 """The view and the sliders."""
 
+import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Route
 
+from shapespace import load
 from tests.page.conftest import Open, Visit
 from tests.page.studio import Hold, OpenPage, body, difference
 
@@ -136,6 +139,20 @@ def test_random_draws_likely_shapes_unless_the_menu_says_otherwise(visit: Visit)
     assert [body["distribution"] for body in asked] == ["population", "uniform"]
     assert asked[0]["seed"] == asked[1]["seed"]
     assert np.abs(likely).mean() < np.abs(studio.code).mean()
+
+
+def test_no_likely_shape_is_called_outside(visit: Visit, models: Path) -> None:
+    model = load(models / "figure")
+    drawn = (seed for seed in range(2, 30) if not model.latents.code(model.sample(1, seed, "population")[0])[1])
+    studio = visit("#model=figure")
+    for seed in itertools.islice(drawn, 2):
+        before = studio.code
+        studio["#seed"].fill(str(seed))
+        studio["#seed"].press("Enter")
+        studio.eventually(lambda before=before: studio.code != before)
+        studio.rest()
+        assert model.latents.code(studio.code)[1]
+        assert "Inside the range" in (studio["#diagnostics"].text_content() or "")
 
 
 def test_an_angle_goes_round(studio: OpenPage) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from shapespace.arrays import FloatArray
 from shapespace.training.runs.settings import ExportSettings
 
-#: Sides as seen by a viewer of the collection's axes, as axis and sign; see ``training.space.factors.names``.
+#: Sides as seen by a viewer of the collection's axes, as axis and sign; see ``training.space.factor_names``.
 SIDES = {"left": (0, -1), "right": (0, 1), "lower": (1, -1), "upper": (1, 1), "back": (2, -1), "front": (2, 1)}
 
 
@@ -28,8 +28,8 @@ def bundle_names(
         NamingError: an unknown name, or one name for two.
 
     >>> plain = ExportSettings(name="a", title="A", description="A.", licence="MIT", faces="+z")
-    >>> bundle_names({"upper right": [0]}, ["upper right"], plain)
-    ({'upper left': [0]}, ['upper left'])
+    >>> bundle_names({"upper right bends": [0]}, ["upper right bends"], plain)
+    ({'upper left bends': [0]}, ['upper left bends'])
     """
     if unknown := sorted(settings.names.keys() - {*factors, *coordinates}):
         known = ", ".join(dict.fromkeys([*factors, *coordinates]))

@@ -4,24 +4,18 @@ For modes that move different parts of a surface, the exponential of the sum is 
 does not hold for modes that move the same part. Such modes form one factor, and one network learns it.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.space.modes import edge_magnitudes
 
 #: Groups whose modes overlap more than this on average are joined in any collection.
 HIGHEST_THRESHOLD = 0.5
 #: Most modes of a factor, because its samples have to fill a box of that dimension.
 LARGEST_FACTOR = 9
-#: An axis gives no names if the mesh's standard deviation along it is below this share of the largest one.
-THIN = 0.2
-#: A part lies to one side if it is further from the centre than this share of the mesh's standard deviation.
-ASIDE = 0.5
 
 
 class FactorError(ValueError):
@@ -95,30 +89,3 @@ def given(groups: Sequence[Sequence[int]], count: int) -> list[list[int]]:
             f"factors.modes can't be used: {'; '.join(faults)}. There are {count} modes, counted from 0 to {count - 1}"
         )
     return [list(group) for group in groups]
-
-
-def names(groups: Sequence[Sequence[int]], nric: FloatArray, norm: WeightedNorm, mean: TriangleMesh) -> list[str]:
-    """Name each factor by its place on the mean, such as "upper left".
-
-    Places are those in a viewer that has x to the right, y up and z towards the eye (glTF's axes). A factor is named by
-    the centre of its modes' squares, on every axis along which the mesh is not thin; "middle" where it is to no side.
-    Names are unique: the second "upper left" is "upper left 2". Modes are (m, 2E), the norm is that at the mean.
-    """
-    middles = mean.edge_midpoints
-    centre, spread = middles.mean(axis=0), middles.std(axis=0)
-    telling = spread >= THIN * spread.max()
-    squares = edge_magnitudes(nric, norm) ** 2
-    result: list[str] = []
-    seen: Counter[str] = Counter()
-    for modes in groups:
-        weights = (squares[list(modes)] / squares[list(modes)].sum(axis=1, keepdims=True)).mean(axis=0)
-        offset = np.where(telling, (weights @ middles - centre) / np.where(telling, spread, 1), 0)
-        words = [
-            pair[int(offset[axis] > 0)]
-            for axis, pair in ((1, ("lower", "upper")), (0, ("left", "right")), (2, ("back", "front")))
-            if abs(offset[axis]) > ASIDE
-        ]
-        name = " ".join(words) or "middle"
-        seen[name] += 1
-        result.append(name if seen[name] == 1 else f"{name} {seen[name]}")
-    return result

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 
 from shapespace.coordinates.nric import WeightedNorm
-from shapespace.training.space.factors import between, given, group, names, overlap
+from shapespace.training.space.factor_names import names
+from shapespace.training.space.factors import between, given, group, overlap
 from shapespace.training.stages.stage import Run, Stage
 
 #: Name of the factor of a straight-line model.
@@ -42,7 +43,7 @@ def find_factors(run: Run) -> None:
     directory.factors.write(
         {
             "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
-            "names": [WHOLE] if straight else names(groups, z, norm, centre),
+            "names": [WHOLE] if straight else names(groups, z, found["vertices"], norm, centre),
             "overlap": between(shared, groups).tolist(),
         }
     )

@@ -196,7 +196,8 @@ distribution.value = here.kept("distribution") ?? "population";
 const draw = reporting(async () => {
   here.keep("seed", seed.value);
   here.keep("distribution", distribution.value);
-  take(await api.sample(store.model, Number(seed.value), distribution.value));
+  // The Gaussian of the population has no bounds, but what the page calls likely must not be outside.
+  take(store.space.clampAll(await api.sample(store.model, Number(seed.value), distribution.value)));
 });
 distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {

@@ -7,7 +7,7 @@ import trimesh
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.space.factors import FactorError, between, given, group, names, overlap
+from shapespace.training.space.factors import FactorError, between, given, group, overlap
 
 #: Which of three regions each of seven modes moves.
 REGIONS = [1, 0, 1, 2, 0, 1, 2]
@@ -118,22 +118,6 @@ def test_overlap_of_factors_is_the_average_over_pairs_of_modes(modes, norm):
     assert found[0, 1] == found[1, 0] == pytest.approx(shared[np.ix_([0, 2, 5], [1, 4])].mean())
     assert found[2, 2] == pytest.approx(shared[np.ix_([3, 6], [3, 6])].mean())
     assert found.diagonal().min() > 10 * found[~np.eye(3, dtype=bool)].max()
-
-
-def test_names_say_where_and_are_unique(modes, norm, mesh):
-    assert names(PLANTED, modes, norm, mesh) == ["middle", "left", "right"]
-    assert names([[1], [4], [3], [6]], modes, norm, mesh) == ["left", "left 2", "right", "right 2"]
-    assert names([list(range(7))], modes, norm, mesh) == ["middle"]
-
-
-def test_names_know_every_side_but_not_of_a_thin_axis(norm, mesh):
-    middles = mesh.edge_midpoints - [10, 20, 30]
-    corner = (middles[:, 0] > 1) & (middles[:, 1] < -0.4)
-    behind = middles[:, 2] < -0.4
-    nric = np.concatenate([[corner, behind], np.zeros((2, len(corner)))], axis=1)
-    assert names([[0], [1]], nric, norm, mesh) == ["lower right", "middle"]
-    deep = mesh.with_vertices(mesh.vertices * [1, 1, 2])
-    assert names([[0], [1]], nric, norm, deep) == ["lower right", "back"]
 
 
 def test_given_factors_stay_in_their_order():

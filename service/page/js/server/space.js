@@ -24,6 +24,17 @@ export class LatentSpace {
     return code.map((value, k) => this.wrap(k, value));
   }
 
+  /** Return a code inside the bounds: a coordinate outside moves to its nearer bound, in the address's digits. */
+  clampAll(code) {
+    return this.wrapAll(code).map((value, k) => {
+      const low = Math.ceil(1e5 * this.lower[k]) / 1e5;
+      const high = Math.floor(1e5 * this.upper[k]) / 1e5;
+      if (value >= low && value <= high) return value;
+      const away = (bound) => Math.abs(this.#shorter(k, value - bound));
+      return away(low) <= away(high) ? low : high;
+    });
+  }
+
   /** Return the ends of a slider: somewhat beyond the bounds, or one period. */
   range(k) {
     if (this.period[k]) return [this.lower[k], this.lower[k] + this.period[k]];
