@@ -31,10 +31,13 @@ def joined_scripts(folder: Path = PAGE / "js", instead: Mapping[str, str] | None
         instead: paths of modules, each with the path of one that takes its place. That one alone still imports it.
 
     Raises:
-        ValueError: a module has an import or export of an unknown form, or imports itself by way of others.
+        ValueError: a module has an import or export of an unknown form, or imports itself by way of others; or one
+            of `first.js` imports a library.
     """
     parts = _Parts(folder, instead or {})
     first = [*parts.added(FIRST)]
+    if parts.libraries:
+        raise ValueError(f"the first requests would wait for {', '.join(parts.libraries)}: import it later")
     names = ", ".join(parts.names)
     main = [*parts.added(MAIN)]
     libraries = [f'import * as {_name(library)} from "{library}";' for library in parts.libraries]

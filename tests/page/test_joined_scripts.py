@@ -93,3 +93,9 @@ def test_modules_in_a_circle_are_refused(tmp_path: Path) -> None:
     around = {"low.js": 'import { place } from "./place.js";\n', "place.js": 'import { LOW } from "./low.js";\n'}
     with pytest.raises(ValueError, match="imports it by way of others"):
         joined_scripts(_written(tmp_path, MODULES | around))
+
+
+def test_the_first_requests_wait_for_no_library(tmp_path: Path) -> None:
+    first = {"server/first.js": f'import {{ join }} from "node:path";\n{MODULES["server/first.js"]}'}
+    with pytest.raises(ValueError, match="the first requests would wait for node:path"):
+        joined_scripts(_written(tmp_path, MODULES | first))

@@ -7,7 +7,6 @@ import { origin, Problem } from "../server/api.js";
 import { readNpz } from "../server/npz.js";
 import { LatentSpace, sameCode } from "../server/space.js";
 import { answer, Decoder } from "../decoder/decoder.js";
-import { withPositions } from "./glb.js";
 
 export * from "../server/api.js";
 
@@ -100,6 +99,7 @@ export async function sample(_model, seed, distribution) {
 export async function file(path, body) {
   if (!path || !body) return refuse("An animation file");
   const { shapes: found } = await shapes(await card(), [body.latent], "fine", { quality: "draft" });
+  const { withPositions } = await import("./glb.js"); // with three.js, for which the first requests don't wait
   return new Blob([withPositions(await textured(), found[0])], { type: "model/gltf-binary" });
 }
 
