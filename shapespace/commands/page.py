@@ -19,15 +19,12 @@ from shapespace.files.poster import poster
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Distribution
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.page_scripts import PAGE, joined_scripts
 
-#: The web page of the server.
-PAGE = Path(__file__).parents[1] / "service" / "page"
 #: Number of random codes of each distribution, one for each seed from 0.
 SEEDS = 1000
 #: Members of a manifest that the page does not show.
 _UNSEEN = {"combiner", "decoder", "files", "geometry", "onnx_tolerance", "origin", "start", "without_decoder"}
-#: Module of the calls, and the module that answers them from files.
-_CALLS, _ANSWERS = "page/js/server/api.js", "page/js/static/api.js"
 
 PARAMS = (
     MODEL,
@@ -57,22 +54,12 @@ def _page() -> Iterator[tuple[str, bytes]]:
     for path in sorted(PAGE.rglob("*")):
         if path.is_file() and path != PAGE / "index.html":
             yield f"page/{path.relative_to(PAGE).as_posix()}", path.read_bytes()
+    for name, content in joined_scripts(instead={"server/api.js": "static/api.js"}).items():
+        yield f"page/{name}", content
     text = (PAGE / "index.html").read_text("utf-8")
-    # The answers' own module calls the module of the calls for what both have.
-    maps = {
-        "imports": {f"./{_CALLS}": f"./{_ANSWERS}"},
-        "scopes": {"./page/js/static/": {f"./{_CALLS}": f"./{_CALLS}"}},
-    }
-    start = text.index('{"imports"')
-    given = text[start : text.index("</script>", start)]
-    imports = json.loads(given)["imports"] | maps["imports"]
-    ahead = f'<link rel="modulepreload" href="{_CALLS}">'
-    needed = [_ANSWERS, "page/js/static/glb.js", "page/js/decoder/decoder.js"]
     for old, new in (
         ('<html lang="en">', '<html lang="en" class="static">'),
-        (given, json.dumps(maps | {"imports": imports})),
         ('href: "v1/models"', 'href: "model/card.json"'),
-        (ahead, "\n  ".join(ahead.replace(_CALLS, name) for name in (_CALLS, *needed))),
     ):
         if text.count(old) != 1:
             raise RuntimeError(f"the page has {old!r} {text.count(old)} times")
@@ -92,18 +79,24 @@ def _model(model: ShapeModel) -> dict[str, bytes]:
     reference = model.vertices
     home = np.where((model.lower <= 0) & (model.upper >= 0), 0, (model.lower + model.upper) / 2)
     (code,), _ = model.latents.codes([home.tolist()])
-    arrays = {"vertices": reference, "faces": model.faces, "home": model.shape(code).vertices}
-    for each in (Distribution.POPULATION, Distribution.UNIFORM):
-        arrays[each] = np.concatenate([model.sample(1, seed, each) for seed in range(SEEDS)])
-    narrow = {name: np.asarray(array, "<i4" if name == "faces" else "<f4") for name, array in arrays.items()}
+    meshes = {"vertices": reference, "faces": model.faces, "home": model.shape(code).vertices}
+    codes = {
+        each.value: np.concatenate([model.sample(1, seed, each) for seed in range(SEEDS)])
+        for each in (Distribution.POPULATION, Distribution.UNIFORM)
+    }
     surface = model.decoder.surface(MeshChoice.FINE)
     return {
         "model/card.json": json.dumps(_card(model), ensure_ascii=False, allow_nan=False).encode(),
-        "model/arrays.npz": npz_bytes(narrow),
+        "model/meshes.npz": _narrow(meshes),
+        "model/codes.npz": _narrow(codes),
         "model/reference.glb": MESH_FORMATS["glb"].encode(reference, model.faces, None, surface),
         "model/poster.svg": poster(model.reference),
         "model/decoder.onnx": (model.folder / facts.decoder.file).read_bytes(),
     }
+
+
+def _narrow(arrays: Mapping[str, np.ndarray]) -> bytes:
+    return npz_bytes({name: np.asarray(array, "<i4" if name == "faces" else "<f4") for name, array in arrays.items()})
 
 
 def _card(model: ShapeModel) -> dict[str, Any]:

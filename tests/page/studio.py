@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -38,7 +39,7 @@ RESET = """() => {
 class Hold:
     """Holds the requests to addresses that match a pattern, until `release`; `routes` has those that are held."""
 
-    def __init__(self, page: Page, address: str) -> None:
+    def __init__(self, page: Page, address: str | re.Pattern[str]) -> None:
         self.routes: list[Route] = []
         self._released = False
         page.route(address, lambda route: route.continue_() if self._released else self.routes.append(route))

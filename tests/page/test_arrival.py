@@ -7,15 +7,24 @@ import numpy as np
 from tests.page.conftest import Open
 from tests.page.studio import Hold, slow_down
 
+#: Scripts that arrive while another does.
+AHEAD = ("first.js", "three.module.min.js", "three.core.min.js", "OrbitControls.js")
+
 
 def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open) -> None:
     studio = window()
-    held = Hold(studio.page, "**/js/view/*.js")
+    held = Hold(studio.page, "**/page/main.js")
     answered: list[str] = []
     studio.page.on("requestfinished", lambda request: answered.append(request.url))
     studio.page.goto(f"{studio.url}/#model=figure", wait_until="commit")
-    # The answers for the first shape come beside the scripts.
-    for call in ("/v1/models$", "figure/mesh", "figure/vertices", "poster/figure.svg"):
+    # The answers for the first shape come beside the scripts, and no script waits for another that names it.
+    for call in (
+        "/v1/models$",
+        "figure/mesh",
+        "figure/vertices",
+        "poster/figure.svg",
+        *(f"/{name}$" for name in AHEAD),
+    ):
         studio.eventually(lambda call=call: any(re.search(call, url) for url in answered))  # type: ignore[misc]
     assert studio["#without"].is_hidden()
     assert studio["#busy"].is_visible()
@@ -32,6 +41,8 @@ def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open
     assert not studio.waits
     # The first draft is not requested again.
     assert [body for body in studio.asked if body == asked[0]] == asked
+    scripts = [address.rpartition("/")[2] for address in studio.addresses if address.endswith(".js")]
+    assert sorted(scripts) == sorted([*AHEAD, "main.js"])
 
 
 #: Notes whether a notice was seen at any time before the first shape.
@@ -58,12 +69,12 @@ def test_on_a_slow_line_nothing_is_said_until_the_shape_is_there(window: Open) -
 
 def test_a_script_that_does_not_arrive_is_told_with_a_way_out(window: Open) -> None:
     studio = window(complains=True)
-    studio.page.route("**/js/view/stage.js", lambda route: route.abort())
+    studio.page.route("**/page/main.js", lambda route: route.abort())
     studio.page.goto(f"{studio.url}/#model=with-fine&z=0.1,0,0")
     studio.eventually(studio["#lost"].is_visible)
     assert studio["#without"].is_hidden()
     assert studio["main"].is_hidden()
-    studio.page.unroute("**/js/view/stage.js")
+    studio.page.unroute("**/page/main.js")
     studio["#lost a"].click()
     studio.rest()
     assert studio.code == [0.1, 0, 0]

@@ -76,7 +76,7 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
 
     plain = window().page  # a page without content security policy
     plain.goto("about:blank")
-    studio[".video-format"].first.select_option("webm")
+    studio["#tab-files .video-format"].select_option("webm")
     studio["#turntable-seconds"].fill("5")  # long enough for a busy machine to record some of it
     name, content = kept(studio, "#turntable")
     assert name == "with-fine-turntable.webm"
@@ -98,7 +98,7 @@ def test_a_picture_a_turntable_and_the_path_as_a_video(window: Open) -> None:
     studio.until_code([0.2, 0, 1])
     studio.rest()
 
-    studio[".video-format"].last.select_option("mp4")
+    studio["#tab-path .video-format"].select_option("mp4")
     name, content = kept(studio, "#film")
     assert name == "with-fine-animation.mp4"
     assert content[4:8] == b"ftyp"

@@ -13,13 +13,14 @@ import httpx
 import numpy as np
 import pytest
 
-from shapespace.commands.page import PAGE, page
+from shapespace.commands.page import page
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel, load
+from shapespace.page_scripts import PAGE
 from tests.page.conftest import Open
-from tests.page.studio import OpenPage
+from tests.page.studio import Hold, OpenPage
 from tests.page.test_texture import dressed
 from tests.service.conftest import ROOT, Server
 from tests.surfaces import png
@@ -65,7 +66,11 @@ def saved(studio: OpenPage, button: str) -> bytes:
 def test_sliders_random_shapes_paths_and_downloads_need_no_server(site: Site, window: Open) -> None:
     size = sum(path.stat().st_size for path in site.folder.rglob("*") if path.is_file())
     assert size < 1e6 * MEGABYTES
-    studio = window(site.url).open("index.html")
+    studio = window(site.url)
+    # The first shape needs neither the decoder nor random codes.
+    held = Hold(studio.page, re.compile(r"decoder\.onnx|\.wasm|codes\.npz"))
+    studio.open("index.html")
+    held.release()
     still = studio.picture()
     studio.slide(0, 0.8)
     studio.until_code([0.8] + 19 * [0])

@@ -1,8 +1,6 @@
 """The page's scripts agree with the types in their comments, and are formatted by prettier."""
 
-import re
 import subprocess
-from pathlib import Path
 
 from tests.service.conftest import ROOT
 
@@ -31,24 +29,3 @@ def test_the_scripts_are_sound_by_their_types() -> None:
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.stdout == ""
     assert found.returncode == 0
-
-
-def test_every_module_is_loaded_ahead() -> None:
-    """Otherwise a browser would find the imports only one file after the other."""
-    page = ROOT / "service" / "page"
-    links = re.findall(
-        r'rel="modulepreload"( fetchpriority="low")? href="page/(.+?)"', (page / "index.html").read_text()
-    )
-    first, main = (_imported(page / "js" / name) for name in ("server/first.js", "main.js"))
-    modules = first | main | {*(page / "vendor" / "three").rglob("*.js")}
-    assert sorted(path for _, path in links) == sorted(path.relative_to(page).as_posix() for path in modules)
-    # What the first requests need comes first.
-    assert {page / path for later, path in links if not later} == first
-
-
-def _imported(script: Path) -> set[Path]:
-    """A script, and all scripts that it imports."""
-    found = {script}
-    for name in re.findall(r'^import .*"(\..+?)";$', script.read_text(), re.MULTILINE):
-        found |= _imported((script.parent / name).resolve())
-    return found

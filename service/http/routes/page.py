@@ -19,25 +19,35 @@ from starlette.staticfiles import NotModifiedResponse, StaticFiles
 from starlette.types import Scope
 
 from shapespace.files.poster import poster
+from shapespace.page_scripts import PAGE, joined_scripts
 from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import Model, ServiceDependency
 from shapespace.service.http.responses import cached_response
-
-FOLDER = Path(__file__).parents[2] / "page"
 
 router = APIRouter(include_in_schema=False)
 
 
 class TaggedFiles(StaticFiles):
-    """Static files whose entity tags are digests of their content, so that replicas agree."""
+    """Static files whose entity tags are digests of their content, so that replicas agree; and the joined scripts."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """Return a file or joined scripts, or 304 if the client has it already."""
+        content = _scripts().get(path)
+        if content is None or scope["method"] not in {"GET", "HEAD"}:
+            return await super().get_response(path, scope)
+        return self._answer(Response(content, media_type="text/javascript"), entity_tag(content), scope)
 
     def file_response(
         self, full_path: str | os.PathLike[str], stat_result: os.stat_result, scope: Scope, status_code: int = 200
     ) -> Response:
         """Return a file, or 304 if the client has it already."""
-        # no-cache, so that a page never loads modules of two versions.
-        headers = {"ETag": _tag(os.fspath(full_path), stat_result.st_mtime_ns), "Cache-Control": "no-cache"}
-        response = FileResponse(full_path, status_code, headers, stat_result=stat_result)
+        tag = _tag(os.fspath(full_path), stat_result.st_mtime_ns)
+        response = FileResponse(full_path, status_code, stat_result=stat_result)
+        return self._answer(response, tag, scope)
+
+    def _answer(self, response: Response, tag: str, scope: Scope) -> Response:
+        # no-cache, so that a page never loads scripts of two versions.
+        response.headers.update({"ETag": tag, "Cache-Control": "no-cache"})
         if self.is_not_modified(response.headers, Headers(scope=scope)):
             return NotModifiedResponse(response.headers)
         return response
@@ -48,7 +58,12 @@ def _tag(path: str, _changed: int) -> str:
     return entity_tag(Path(path).read_bytes())
 
 
-_FILES = TaggedFiles(directory=FOLDER)
+@cache
+def _scripts() -> dict[str, bytes]:
+    return joined_scripts()
+
+
+_FILES = TaggedFiles(directory=PAGE)
 
 
 @router.api_route("/", methods=["GET", "HEAD"])
@@ -82,7 +97,7 @@ def assets() -> BaseRoute:
 def _policy() -> str:
     """Return the content security policy: files of this server only, and the inline scripts by their digests."""
     inline = re.findall(
-        r"<script(?: type=\"importmap\")?>(.*?)</script>", (FOLDER / "index.html").read_text("utf-8"), re.DOTALL
+        r"<script(?: type=\"\w+\")?>(.*?)</script>", (PAGE / "index.html").read_text("utf-8"), re.DOTALL
     )
     digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in inline)
     scripts = " ".join(["'self'", *(f"'sha256-{digest}'" for digest in digests)])

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import httpx
 
-from shapespace.service.http.routes.page import FOLDER, TaggedFiles
+from shapespace.page_scripts import PAGE
+from shapespace.service.http.routes.page import TaggedFiles
 from tests.service.bundles import write_bundle
 
 
@@ -59,6 +60,6 @@ def test_tags_of_the_page_are_those_of_its_content_whenever_its_files_were_writt
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
             return (await client.get("/index.html")).headers["ETag"]
 
-    content = (FOLDER / "index.html").read_bytes()
+    content = (PAGE / "index.html").read_bytes()
     one, other, changed = (asyncio.run(tag(k, c)) for k, c in enumerate((content, content, content[:-1])))
     assert one == other != changed

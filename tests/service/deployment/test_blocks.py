@@ -24,10 +24,10 @@ import pytest
 
 from shapespace.__main__ import PROGRAM
 from shapespace.command_line import Subcommand
-from shapespace.commands.page import PAGE
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from shapespace.model.shape_model import load
+from shapespace.page_scripts import PAGE
 from shapespace.service.settings import PREFIX, Settings
 from shapespace.training.runs.config import parse
 from tests.long.__main__ import TESTS

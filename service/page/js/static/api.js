@@ -1,20 +1,18 @@
 /**
- * The page's calls where there is no server: answers from the files of `shapespace page`. The import map of
- * such a page puts this module in the place of `server/api.js`.
+ * The page's calls where there is no server: answers from the files of `shapespace page`. In such
+ * a page this module takes the place of `server/api.js`.
  */
 
 import { origin, Problem } from "../server/api.js";
 import { readNpz } from "../server/npz.js";
 import { LatentSpace, sameCode } from "../server/space.js";
 import { answer, Decoder } from "../decoder/decoder.js";
-import { withPositions } from "./glb.js";
 
 export * from "../server/api.js";
 
 /** There is no server that answers calls. */
 export const answersCalls = false;
 
-const ARRAYS = ["vertices", "faces", "home", "population", "uniform"];
 const place = (name) => `${origin}/model/${name}`;
 
 /** Return a function that computes its value once; after an error it tries again. */
@@ -36,7 +34,10 @@ async function content(name) {
 }
 
 const card = once(async () => (await content("card.json")).json());
-const arrays = once(async () => readNpz(await (await content("arrays.npz")).arrayBuffer(), ARRAYS));
+const archive = (name, ...arrays) =>
+  once(async () => readNpz(await (await content(name)).arrayBuffer(), arrays));
+const meshes = archive("meshes.npz", "vertices", "faces", "home");
+const codes = archive("codes.npz", "population", "uniform");
 const decoder = once(async () => {
   const opened = new Decoder(place("decoder.onnx"));
   try {
@@ -52,14 +53,15 @@ export const posterOf = () => place("poster.svg");
 export const models = async () => [await card()];
 export const modelCard = card;
 
-/** Load the decoder early, if the first code needs it. */
+/** Load what the first shape needs. */
 export function ask(model, code) {
-  if (!sameCode(code, new LatentSpace(model).home)) decoder().catch(() => {}); // the first shape reports it
+  const needed = [meshes(), ...(sameCode(code, new LatentSpace(model).home) ? [] : [decoder()])];
+  for (const each of needed) each.catch(() => {}); // the first shape reports it
 }
 
 /** Return positions and faces of the reference, which has one mesh here. */
 export async function reference() {
-  const { vertices, faces } = await arrays();
+  const { vertices, faces } = await meshes();
   return { vertices: vertices.data, faces: faces.data };
 }
 
@@ -75,7 +77,7 @@ export const textured = async () => (await content("reference.glb")).arrayBuffer
  */
 export async function shapes(model, latents, _mesh, { quality = "full", signal } = {}) {
   const space = new LatentSpace(model);
-  const { home } = await arrays();
+  const { home } = await meshes();
   const compute = async (code) => {
     if (sameCode(code, space.home)) return { positions: home.data.slice(), misfit: 0 };
     return (await decoder()).shape(code, { urgent: quality === "draft", signal });
@@ -89,7 +91,7 @@ export async function sample(_model, seed, distribution) {
   const {
     shape: [count, m],
     data,
-  } = (await arrays())[distribution];
+  } = (await codes())[distribution];
   return [...data.subarray((seed % count) * m, (seed % count) * m + m)];
 }
 
@@ -97,6 +99,7 @@ export async function sample(_model, seed, distribution) {
 export async function file(path, body) {
   if (!path || !body) return refuse("An animation file");
   const { shapes: found } = await shapes(await card(), [body.latent], "fine", { quality: "draft" });
+  const { withPositions } = await import("./glb.js"); // with three.js, for which the first requests don't wait
   return new Blob([withPositions(await textured(), found[0])], { type: "model/gltf-binary" });
 }
 
