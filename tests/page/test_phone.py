@@ -25,10 +25,11 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
         if model != "figure":
             studio.open(f"#model={model}")
             studio.eventually(lambda: studio[".coordinate"].count() == 3)
-        assert (studio["#welcome"].is_visible(), sliders(studio) >= 3) == (model == "figure", True)
+        studio.eventually(lambda: sliders(studio) >= 3)
+        assert studio["#welcome"].is_visible() == (model == "figure")
         if model == "figure":
             studio["#welcome [data-do=close]"].click()
-            assert sliders(studio) >= 3
+            studio.eventually(lambda: sliders(studio) >= 3)
         assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     header = studio["header"].bounding_box()
     assert header
@@ -48,6 +49,30 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
         assert studio[name].is_visible()
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
+    studio.page.keyboard.press("Escape")
+    studio["#to-look"].click()
+    tools, menu = studio[".tools"].bounding_box(), studio["#look"].bounding_box()
+    assert tools
+    assert menu
+    assert tools["y"] + tools["height"] <= menu["y"], "the menu covers no buttons"
+    assert menu["y"] + menu["height"] <= height
+
+
+def test_tables_and_fields_fit_the_dialogs_of_a_phone(visit: Visit) -> None:
+    studio = visit("#model=figure", size=(390, 844))
+    studio["#to-more"].click()
+    for button, dialog in (("#about", "#card"), ("#name", "#names")):
+        studio[button].click()
+        studio.eventually(studio[dialog].is_visible)
+        assert studio[dialog].evaluate("e => e.scrollWidth <= e.clientWidth"), dialog
+        studio.page.keyboard.press("Escape")
+
+
+def test_a_legend_below_the_shape_leaves_the_buttons_in_one_row(visit: Visit) -> None:
+    studio = visit("#model=with-fine&z=0.1,1,0.5&colour=stretch", size=(844, 390))
+    studio.eventually(studio["#legend"].is_visible)
+    tops = studio[".tools button:visible"].evaluate_all("all => all.map((b) => b.getBoundingClientRect().top)")
+    assert max(tops) - min(tops) < 10
 
 
 def test_the_sheet_is_dragged_pressed_and_moved_by_keys(visit: Visit) -> None:
