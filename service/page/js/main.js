@@ -1,7 +1,7 @@
 /** Puts the page together: one store, and the parts that show or change its values. */
 
 import { fromHash, toHash } from "./address.js";
-import { element, find, toggle } from "./dom.js";
+import { element, find, toggle, within } from "./dom.js";
 import { Hand } from "./hand.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
@@ -200,11 +200,11 @@ const draw = reporting(async () => {
 });
 distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {
-  seed.value = Number(seed.value) + 1;
+  seed.value = (within(seed) + 1) % (Number(seed.max) + 1);
   draw();
 });
 seed.addEventListener("change", () => {
-  if (seed.validity.valid && seed.value !== "") draw();
+  if (seed.value !== "") draw(within(seed));
 });
 find("#draw-strip").addEventListener(
   "click",
