@@ -68,6 +68,23 @@ def test_tables_and_fields_fit_the_dialogs_of_a_phone(visit: Visit) -> None:
         studio.page.keyboard.press("Escape")
 
 
+@pytest.mark.parametrize("size", [(1200, 700), (390, 844), (844, 390)])
+def test_a_message_leaves_the_sliders_free_and_is_not_there_twice(visit: Visit, size: tuple[int, int]) -> None:
+    studio = visit(size=size, complains=True)
+    studio.page.route("**/sample*", lambda route: route.abort())
+    for _ in range(2):
+        studio["#random"].click()
+        studio.eventually(lambda: "does not answer" in studio.messages)
+    script = "async () => { const { say } = await import('/page/js/messages.js'); say('A fault', { kind: 'error' }); }"
+    for _ in range(2):
+        studio.page.evaluate(script)
+    assert studio["#messages .message:visible"].count() == 2
+    message, panel = studio["#messages"].bounding_box(), studio[".panel"].bounding_box()
+    assert message
+    assert panel
+    assert message["x"] + message["width"] <= panel["x"] or message["y"] + message["height"] <= panel["y"]
+
+
 def test_a_legend_below_the_shape_leaves_the_buttons_in_one_row(visit: Visit) -> None:
     studio = visit("#model=with-fine&z=0.1,1,0.5&colour=stretch", size=(844, 390))
     studio.eventually(studio["#legend"].is_visible)
