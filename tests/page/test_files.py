@@ -103,6 +103,7 @@ def test_the_copied_calls_answer_the_shape(studio: OpenPage, expected: np.ndarra
 
     command = shlex.split(copied("curl"))
     assert command[0] == "curl"
+    assert "%2C" not in command[1], "numbers that people can read"
     options = dict(zip(command[2::2], command[3::2], strict=True))
     name, _, value = options["-H"].partition(": ")
     answer = httpx.post(command[1], content=options["-d"], headers={name: value}, timeout=60).raise_for_status()

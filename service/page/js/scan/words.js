@@ -7,6 +7,8 @@ const percent = (share) => `${readable(100 * share, 2)} %`;
 /** Largest mean distances, as shares of the diagonal, for each verdict on a mesh in correspondence. */
 const GOOD = 0.01;
 const FAIR = 0.03;
+/** Shares of the diagonal below which a movement is none. */
+const SMALL = 1e-3;
 const KEPT = "Your shape stays as it was.";
 
 /**
@@ -83,7 +85,7 @@ export function fitInWords(answer, { file, model, diagonal }) {
     words.push("The mirror image fits much better. Perhaps one axis of the file has the wrong sign.");
   }
   if (how === "poor") words.push(KEPT);
-  return { how, title, words, more: [place(placement), ...rest(back, size, noise)] };
+  return { how, title, words, more: [place(placement, size), ...rest(back, size, noise)] };
 }
 
 const rest = (back, size, noise) => [
@@ -94,9 +96,10 @@ const rest = (back, size, noise) => [
 /** Return the first sentence of a reason; the others are for programs. */
 const sentence = (reason) => `${reason.split(/\.\s/)[0].replace(/\.$/, "")}.`;
 
-function place({ rotation: [[a], [, b], [, , c]], translation, scale }) {
+function place({ rotation: [[a], [, b], [, , c]], translation, scale }, size) {
   const angle = (180 / Math.PI) * Math.acos(Math.min(Math.max((a + b + c - 1) / 2, -1), 1));
-  const to = translation.map((value) => readable(value).replace("-", "−")).join(", ");
+  const seen = (value) => (Math.abs(value) < SMALL * size ? 0 : value);
+  const to = translation.map((value) => readable(seen(value)).replace("-", "−")).join(", ");
   const times =
     Math.abs(scale - 1) < 1e-6 ? "in the model's units" : `${readable(scale)} times the model's size`;
   return `The file has it turned by ${angle.toFixed(0)}°, moved by (${to}), ${times}.`;
