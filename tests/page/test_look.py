@@ -64,6 +64,11 @@ def test_only_what_differs_from_home_can_be_reset(studio: OpenPage) -> None:
     assert studio.page.evaluate("document.activeElement.id") == "z2", "the focus stays in the row"
 
 
+def test_the_field_of_the_seed_says_what_it_is(visit: Visit) -> None:
+    studio = visit(size=(1280, 700))
+    assert "Seed" in studio["#more"].inner_text()
+
+
 def test_what_is_pressed_is_seen_in_forced_colours(window: Open) -> None:
     studio = window(forced_colors="active").open()
     pressed, other = (

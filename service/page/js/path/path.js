@@ -31,7 +31,8 @@ export class Path {
     this.time = time;
     this.status = status;
     const tell = () => {
-      seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : "";
+      seconds.disabled = store.keyframes.length < 2;
+      seconds.value = seconds.disabled ? "" : readable(this.seconds);
     };
     store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
     seconds.addEventListener("change", () => {
