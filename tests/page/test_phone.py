@@ -13,6 +13,18 @@ SLIDERS = """all => all.filter((slider) => {
 }).length"""
 
 
+#: Whether the longest name of the bundled models fits the menu.
+WHOLE = """menu => {
+    const copy = menu.cloneNode();
+    copy.append(new Option('Freaky Torus'));
+    Object.assign(copy.style, { position: 'absolute', width: 'max-content' });
+    menu.after(copy);
+    const wide = copy.offsetWidth;
+    copy.remove();
+    return wide <= menu.offsetWidth;
+}"""
+
+
 def sliders(studio: OpenPage) -> int:
     return int(studio[".coordinate input[type=range]"].evaluate_all(SLIDERS))
 
@@ -31,6 +43,7 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
             studio["#welcome [data-do=close]"].click()
             studio.eventually(lambda: sliders(studio) >= 3)
         assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert studio["#model"].evaluate(WHOLE), "the model's name is not cut"
     header = studio["header"].bounding_box()
     assert header
     assert header["height"] < 60, "the header has one row"
@@ -66,6 +79,15 @@ def test_tables_and_fields_fit_the_dialogs_of_a_phone(visit: Visit) -> None:
         studio.eventually(studio[dialog].is_visible)
         assert studio[dialog].evaluate("e => e.scrollWidth <= e.clientWidth"), dialog
         studio.page.keyboard.press("Escape")
+
+
+def test_the_legend_does_not_hide_the_head_in_a_narrow_window(visit: Visit) -> None:
+    studio = visit("#model=figure&colour=stretch", size=(900, 700))
+    studio.eventually(studio["#legend"].is_visible)
+    stage, legend = studio[".stage"].bounding_box(), studio["#legend"].bounding_box()
+    assert stage
+    assert legend
+    assert legend["y"] > stage["y"] + 0.8 * stage["height"]
 
 
 @pytest.mark.parametrize("size", [(1200, 700), (390, 844), (844, 390)])

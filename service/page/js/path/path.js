@@ -124,7 +124,7 @@ export class Path {
     this.play.disabled = !ready;
     this.beyond.disabled = loop;
     this.beyond.value = this.store.beyond;
-    this.status.textContent = ready ? "" : "Add two or more keyframes: each takes the shape as it is.";
+    this.status.textContent = ready ? "" : "Add two or more shapes to make a path.";
     this.#tell();
   }
 
