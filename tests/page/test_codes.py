@@ -86,3 +86,7 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     studio["#seed"].fill("1")
     studio["#seed"].press("Enter")
     studio.until_code([*first[:2], locked])
+    for k in range(2):
+        studio.coordinate(k).locator("[data-do=lock]").click()
+    studio["#random"].click()
+    studio.eventually(lambda: "All sliders are locked" in studio.messages)

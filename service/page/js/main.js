@@ -105,7 +105,7 @@ const path = new Path(store, pictures, {
   time: find("#time"),
   status: find("#path-status"),
 });
-const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Shelf(store, pictures, { list: find("#shelf"), add: find("#keep-shape") });
 new Beside(store, viewer);
 new Blend(store, hand, find("#blend"));
@@ -194,6 +194,7 @@ const distribution = find("#distribution");
 seed.value = here.kept("seed") ?? 0;
 distribution.value = here.kept("distribution") ?? "population";
 const draw = reporting(async () => {
+  if (store.locked.every(Boolean)) throw new Error("All sliders are locked. Unlock at least one.");
   here.keep("seed", seed.value);
   here.keep("distribution", distribution.value);
   take(await api.sample(store.model, Number(seed.value), distribution.value));
@@ -206,10 +207,6 @@ find("#random").addEventListener("click", () => {
 seed.addEventListener("change", () => {
   if (seed.value !== "") draw(within(seed));
 });
-find("#draw-strip").addEventListener(
-  "click",
-  reporting(() => strip.draw()),
-);
 find("#about").addEventListener(
   "click",
   reporting(() => openCard(find("#card"), store.model)),

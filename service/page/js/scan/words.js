@@ -9,6 +9,8 @@ const GOOD = 0.01;
 const FAIR = 0.03;
 /** Shares of the diagonal below which a movement is none. */
 const SMALL = 1e-3;
+/** Share of the scan on the shape below which the page doubts that the model fits. */
+const MOST = 0.5;
 const KEPT = "Your shape stays as it was.";
 
 /**
@@ -79,7 +81,12 @@ export function fitInWords(answer, { file, model, diagonal }) {
       `(${readable(scan.mean)} units). 95 % of the points are closer than ${percent(scan.p95 / size)}.`,
     `${percent(explained)} of the scan lies on the shape. The scan covers ${percent(seen)} of the shape.`,
   ];
-  if (status === "deadline") words.push("For a better fit, use fewer points: a few thousand are enough.");
+  if (status === "deadline")
+    words.push(
+      explained < MOST
+        ? "Most of the scan lies off the shape. Perhaps it is no shape of this model."
+        : "For a better fit, use fewer points: a few thousand are enough.",
+    );
   if (status === "ambiguous") words.push(sentence(answer.reason));
   if (typeof mirrored === "number" && mirrored < 0.5) {
     words.push("The mirror image fits much better. Perhaps one axis of the file has the wrong sign.");
