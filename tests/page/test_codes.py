@@ -8,7 +8,7 @@ import numpy as np
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import CODE, Visit
-from tests.page.studio import OpenPage
+from tests.page.studio import Hold, OpenPage
 from tests.service.conftest import Server
 
 
@@ -59,10 +59,34 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     studio.until_different(start)
     assert studio["#seed"].input_value() == "1"
     first = studio.eventually(lambda: studio.code if any(studio.code) else None)
+    for typed, taken in (("-4", "0"), ("1e300", "999999"), ("2.6", "3")):
+        studio["#seed"].fill(typed)
+        studio["#seed"].press("Enter")
+        assert studio["#seed"].input_value() == taken
+    studio["#seed"].fill("999999")
     studio["#random"].click()
-    studio.eventually(lambda: studio.code != first)
+    assert studio["#seed"].input_value() == "0", "after the last seed comes the first"
+    studio["#random"].click()
+    studio.until_code(first)
+    assert studio.messages == ""
+    held = Hold(studio.page, "**/sample*")
+    studio["#random"].click()
+    studio["#random"].click()
+    studio.eventually(lambda: len(held.routes) == 2)
+    held.routes.pop().continue_()
+    second = studio.eventually(lambda: studio.code if studio.code != first else None)
+    held.routes.pop().abort()
+    studio.frames(3)
+    assert (studio.code, studio.messages) == (second, ""), "an earlier answer is no longer wanted"
+    studio.page.unroute_all()
+    studio["#random"].click()
+    studio.eventually(lambda: studio.code != second)
     studio.coordinate(2).locator("[data-do=lock]").click()
     locked = studio.code[2]
     studio["#seed"].fill("1")
     studio["#seed"].press("Enter")
     studio.until_code([*first[:2], locked])
+    for k in range(2):
+        studio.coordinate(k).locator("[data-do=lock]").click()
+    studio["#random"].click()
+    studio.eventually(lambda: "All sliders are locked" in studio.messages)

@@ -130,6 +130,7 @@ def test_the_address_restores_everything(studio: OpenPage, window: Open) -> None
     studio.tab("Colour")
     studio.page.get_by_label("bending").check()
     studio["#against"].select_option("keyframe 1")
+    assert "&against=0.1,1,0.5" in (studio["#code"].text_content() or ""), "numbers that people can read"
     studio["#canvas"].focus()
     studio.page.keyboard.press("ArrowRight")
     studio["#share"].click()

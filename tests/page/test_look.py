@@ -53,6 +53,15 @@ def test_the_turntable_turns_until_the_shape_is_touched(studio: OpenPage) -> Non
     studio.eventually(lambda: difference(start, studio.picture()) < 0.001)
 
 
+def test_the_shape_alone_fills_the_screen(studio: OpenPage) -> None:
+    button = studio["#full-screen"]
+    button.click()
+    studio.eventually(lambda: button.get_attribute("aria-pressed") == "true")
+    assert studio["header"].evaluate("e => !document.fullscreenElement.contains(e)")
+    button.click()
+    studio.eventually(lambda: button.get_attribute("aria-pressed") == "false")
+
+
 def test_only_what_differs_from_home_can_be_reset(studio: OpenPage) -> None:
     resets = studio["[data-do=reset], #reset-all"]
     assert not any(reset.is_visible() for reset in resets.all())
@@ -62,6 +71,11 @@ def test_only_what_differs_from_home_can_be_reset(studio: OpenPage) -> None:
     studio.coordinate(2).locator("[data-do=reset]").press("Enter")
     studio.until_code([0, 0, 0])
     assert studio.page.evaluate("document.activeElement.id") == "z2", "the focus stays in the row"
+
+
+def test_the_field_of_the_seed_says_what_it_is(visit: Visit) -> None:
+    studio = visit(size=(1280, 700))
+    assert "Seed" in studio["#more"].inner_text()
 
 
 def test_what_is_pressed_is_seen_in_forced_colours(window: Open) -> None:

@@ -17,6 +17,8 @@ def without(studio: OpenPage) -> None:
     studio.eventually(studio["#without"].is_visible)
     assert studio["#lost"].is_hidden()
     assert "WebGL" in studio["#without"].inner_text()
+    assert (studio["h1 span"].bounding_box() or {"width": 0})["width"] > 50, "the page says its name"
+    assert studio["h1 span"].evaluate("e => getComputedStyle(e).clipPath") == "none"
     assert "v1/models/NAME/mesh" in studio["#without"].inner_text()
     assert studio["#without a"].first.is_visible()
     assert studio["button:visible"].count() == 0

@@ -46,6 +46,19 @@ def test_people_name_things_for_themselves(visit: Visit) -> None:
     assert "Figure and twist" not in studio.page.evaluate("JSON.stringify({ ...localStorage })")
 
 
+def test_the_fields_for_names_say_what_the_sliders_say(visit: Visit) -> None:
+    studio = visit("#model=figure")
+    names = studio[".coordinate .name"]
+    studio.eventually(lambda: "↔" in (names.nth(19).text_content() or ""), 300)
+    told = names.all_text_contents()
+    studio["#name"].click()
+    fields = studio["#names input[data-key^=coordinate]"]
+    assert fields.first.get_attribute("placeholder") == told[0]
+    assert fields.first.get_attribute("aria-label") == f"Name for left hip, {told[0].replace('↔', 'to')}"
+    assert not any(text.strip().isdigit() for text in studio["#names label"].all_inner_texts())
+    studio.page.keyboard.press("Escape")
+
+
 def test_broken_memory_of_names_does_no_harm(window: Open) -> None:
     studio = window()
     studio.page.add_init_script("localStorage.setItem('names:with-fine', '[{\"a\"')")

@@ -38,6 +38,8 @@ def keyframes(studio: OpenPage, *codes: tuple[float, float, float]) -> None:
 def test_play_pause_and_the_sliders_follow(studio: OpenPage) -> None:
     studio.tab("Path")
     assert studio["#play"].is_disabled()
+    assert studio["#seconds"].is_disabled()
+    assert studio["#animation-format"].is_hidden(), "there is nothing to choose yet"
     studio.tab("Shape")
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
     before = studio.picture()

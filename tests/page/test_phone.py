@@ -13,6 +13,18 @@ SLIDERS = """all => all.filter((slider) => {
 }).length"""
 
 
+#: Whether the longest name of the bundled models fits the menu.
+WHOLE = """menu => {
+    const copy = menu.cloneNode();
+    copy.append(new Option('Freaky Torus'));
+    Object.assign(copy.style, { position: 'absolute', width: 'max-content' });
+    menu.after(copy);
+    const wide = copy.offsetWidth;
+    copy.remove();
+    return wide <= menu.offsetWidth;
+}"""
+
+
 def sliders(studio: OpenPage) -> int:
     return int(studio[".coordinate input[type=range]"].evaluate_all(SLIDERS))
 
@@ -25,11 +37,13 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
         if model != "figure":
             studio.open(f"#model={model}")
             studio.eventually(lambda: studio[".coordinate"].count() == 3)
-        assert (studio["#welcome"].is_visible(), sliders(studio) >= 3) == (model == "figure", True)
+        studio.eventually(lambda: sliders(studio) >= 3)
+        assert studio["#welcome"].is_visible() == (model == "figure")
         if model == "figure":
             studio["#welcome [data-do=close]"].click()
-            assert sliders(studio) >= 3
+            studio.eventually(lambda: sliders(studio) >= 3)
         assert studio.page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert studio["#model"].evaluate(WHOLE), "the model's name is not cut"
     header = studio["header"].bounding_box()
     assert header
     assert header["height"] < 60, "the header has one row"
@@ -48,6 +62,56 @@ def test_three_sliders_stand_beside_the_shape(window: Open, width: int, height: 
         assert studio[name].is_visible()
     studio["#about"].click()
     studio.eventually(studio["#card"].is_visible)
+    studio.page.keyboard.press("Escape")
+    studio["#to-look"].click()
+    tools, menu = studio[".tools"].bounding_box(), studio["#look"].bounding_box()
+    assert tools
+    assert menu
+    assert tools["y"] + tools["height"] <= menu["y"], "the menu covers no buttons"
+    assert menu["y"] + menu["height"] <= height
+
+
+def test_tables_and_fields_fit_the_dialogs_of_a_phone(visit: Visit) -> None:
+    studio = visit("#model=figure", size=(390, 844))
+    studio["#to-more"].click()
+    for button, dialog in (("#about", "#card"), ("#name", "#names")):
+        studio[button].click()
+        studio.eventually(studio[dialog].is_visible)
+        assert studio[dialog].evaluate("e => e.scrollWidth <= e.clientWidth"), dialog
+        studio.page.keyboard.press("Escape")
+
+
+def test_the_legend_does_not_hide_the_head_in_a_narrow_window(visit: Visit) -> None:
+    studio = visit("#model=figure&colour=stretch", size=(900, 700))
+    studio.eventually(studio["#legend"].is_visible)
+    stage, legend = studio[".stage"].bounding_box(), studio["#legend"].bounding_box()
+    assert stage
+    assert legend
+    assert legend["y"] > stage["y"] + 0.8 * stage["height"]
+
+
+@pytest.mark.parametrize("size", [(1200, 700), (390, 844), (844, 390)])
+def test_a_message_leaves_the_sliders_free_and_is_not_there_twice(visit: Visit, size: tuple[int, int]) -> None:
+    studio = visit(size=size, complains=True)
+    studio.page.route("**/sample*", lambda route: route.abort())
+    for _ in range(2):
+        studio["#random"].click()
+        studio.eventually(lambda: "does not answer" in studio.messages)
+    script = "async () => { const { say } = await import('/page/js/messages.js'); say('A fault', { kind: 'error' }); }"
+    for _ in range(2):
+        studio.page.evaluate(script)
+    assert studio["#messages .message:visible"].count() == 2
+    message, panel = studio["#messages"].bounding_box(), studio[".panel"].bounding_box()
+    assert message
+    assert panel
+    assert message["x"] + message["width"] <= panel["x"] or message["y"] + message["height"] <= panel["y"]
+
+
+def test_a_legend_below_the_shape_leaves_the_buttons_in_one_row(visit: Visit) -> None:
+    studio = visit("#model=with-fine&z=0.1,1,0.5&colour=stretch", size=(844, 390))
+    studio.eventually(studio["#legend"].is_visible)
+    tops = studio[".tools button:visible"].evaluate_all("all => all.map((b) => b.getBoundingClientRect().top)")
+    assert max(tops) - min(tops) < 10
 
 
 def test_the_sheet_is_dragged_pressed_and_moved_by_keys(visit: Visit) -> None:

@@ -236,6 +236,7 @@ def test_files_that_are_no_shapes_are_refused_in_words_for_people(visit: Visit, 
         "letter.docx": (b"PK\x03\x04 nothing to see", "This file type is not supported. Save a mesh as .obj"),
         "notes.txt": (b"Dear reader,\nhello\n", "Export the file again"),
         "empty.obj": (b"", "Export"),
+        "list.json": (b'{"a": 1}', "use this file. Export"),
         "flat.xyz": (b"".join(b"%d %d 0\n" % (k % 30, k // 30) for k in range(900)), "lie in a plane"),
     }
     for name, (content, words) in files.items():
@@ -245,6 +246,22 @@ def test_files_that_are_no_shapes_are_refused_in_words_for_people(visit: Visit, 
         assert not re.search(r"[?=]|Content-Type|Send|Ask|JSON", message), message
         assert studio["#verdict"].is_hidden()
         studio["#messages .error button"].first.click()
+
+
+def test_a_movement_too_small_to_see_is_none_and_a_scan_off_the_shape_is_doubted(visit: Visit) -> None:
+    studio = visit()
+    script = """async () => {
+        const { fitInWords } = await import('/page/js/scan/words.js');
+        const far = { mean: 0, p95: 0 };
+        const placement = { rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], translation: [3e-5, -2, -1e-9], scale: 1 };
+        const answer = { status: 'converged', distances: { scan: far, model: far }, explained: 1, seen: 1, placement };
+        const [sure, doubtful] = [{}, { status: 'deadline', explained: 0.2 }].map((change) =>
+            fitInWords({ ...answer, noise: 0, ...change }, { file: 'a', model: 'b', diagonal: 2 }));
+        return [sure.more[0], doubtful.words.at(-1)];
+    }"""
+    place, doubt = studio.page.evaluate(script)
+    assert "moved by (0, −2, 0)" in place
+    assert "Perhaps it is no shape of this model" in doubt
 
 
 def test_a_part_is_fitted_as_a_part(visit: Visit, given: Given) -> None:

@@ -12,6 +12,13 @@ export const element = (name, properties = {}, ...children) => {
 /** Format a number with its meaningful digits. */
 export const readable = (value, digits = 3) => Number(value.toPrecision(digits)).toString();
 
+/** Return the whole number in an input, moved into its range, and write it there. */
+export function within(input) {
+  const whole = Math.round(input.valueAsNumber) || 0;
+  input.value = Math.min(Math.max(whole, Number(input.min)), Number(input.max));
+  return input.valueAsNumber;
+}
+
 /** Format a share as percent. One below the whole never reads 100. */
 export function almost(share) {
   const texts = [2, 3, 4, 5].map((digits) => (100 * share).toFixed(digits));

@@ -1,7 +1,7 @@
 /** Puts the page together: one store, and the parts that show or change its values. */
 
 import { fromHash, toHash } from "./address.js";
-import { element, find, toggle } from "./dom.js";
+import { element, find, toggle, within } from "./dom.js";
 import { Hand } from "./hand.js";
 import { History } from "./history.js";
 import { always, here } from "./memory.js";
@@ -105,7 +105,7 @@ const path = new Path(store, pictures, {
   time: find("#time"),
   status: find("#path-status"),
 });
-const strip = new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
+new Strip(store, pictures, { button: find("#draw-strip"), table: find("#strip") });
 new Shelf(store, pictures, { list: find("#shelf"), add: find("#keep-shape") });
 new Beside(store, viewer);
 new Blend(store, hand, find("#blend"));
@@ -194,6 +194,7 @@ const distribution = find("#distribution");
 seed.value = here.kept("seed") ?? 0;
 distribution.value = here.kept("distribution") ?? "population";
 const draw = reporting(async () => {
+  if (store.locked.every(Boolean)) throw new Error("All sliders are locked. Unlock at least one.");
   here.keep("seed", seed.value);
   here.keep("distribution", distribution.value);
   // The Gaussian of the population has no bounds, but what the page calls likely must not be outside.
@@ -201,16 +202,12 @@ const draw = reporting(async () => {
 });
 distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {
-  seed.value = Number(seed.value) + 1;
+  seed.value = (within(seed) + 1) % (Number(seed.max) + 1);
   draw();
 });
 seed.addEventListener("change", () => {
-  if (seed.validity.valid && seed.value !== "") draw();
+  if (seed.value !== "") draw(within(seed));
 });
-find("#draw-strip").addEventListener(
-  "click",
-  reporting(() => strip.draw()),
-);
 find("#about").addEventListener(
   "click",
   reporting(() => openCard(find("#card"), store.model)),

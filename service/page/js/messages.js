@@ -9,6 +9,8 @@ const box = document.querySelector("#messages");
  */
 export function say(text, { kind = "note", key } = {}) {
   takeBack(key);
+  // What is said again is not there twice.
+  for (const old of [...box.children]) if (old.firstChild.textContent === text) old.remove();
   const line = document.createElement("div");
   line.className = `message ${kind}`;
   line.dataset.key = key ?? "";

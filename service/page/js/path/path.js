@@ -31,7 +31,8 @@ export class Path {
     this.time = time;
     this.status = status;
     const tell = () => {
-      seconds.value = store.keyframes.length > 1 ? readable(this.seconds) : "";
+      seconds.disabled = store.keyframes.length < 2;
+      seconds.value = seconds.disabled ? "" : readable(this.seconds);
     };
     store.on(["seconds", "keyframes", "loop", "beyond", "model"], tell);
     seconds.addEventListener("change", () => {
@@ -123,7 +124,7 @@ export class Path {
     this.play.disabled = !ready;
     this.beyond.disabled = loop;
     this.beyond.value = this.store.beyond;
-    this.status.textContent = ready ? "" : "Add two or more keyframes: each takes the shape as it is.";
+    this.status.textContent = ready ? "" : "Add two or more shapes to make a path.";
     this.#tell();
   }
 

@@ -2,6 +2,7 @@
 
 import * as api from "../server/api.js";
 import { element, find, sharp } from "../dom.js";
+import { reporting } from "../messages.js";
 
 const COLUMNS = 5;
 const PICTURE = 72;
@@ -12,7 +13,10 @@ export class Strip {
     this.store = store;
     this.pictures = pictures;
     this.table = table;
-    this.button = button;
+    button.addEventListener(
+      "click",
+      reporting(() => this.#draw()),
+    );
     // The page may learn names of sliders while the strip is there.
     store.on(["names"], () => {
       table.querySelectorAll("tbody th").forEach((head, row) => {
@@ -25,7 +29,7 @@ export class Strip {
     });
   }
 
-  async draw() {
+  async #draw() {
     const { keyframes, model, names, space } = this.store;
     const t = Array.from({ length: COLUMNS }, (_, i) => i / (COLUMNS - 1));
     const codes = space.along(

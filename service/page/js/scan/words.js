@@ -7,6 +7,10 @@ const percent = (share) => `${readable(100 * share, 2)} %`;
 /** Largest mean distances, as shares of the diagonal, for each verdict on a mesh in correspondence. */
 const GOOD = 0.01;
 const FAIR = 0.03;
+/** Shares of the diagonal below which a movement is none. */
+const SMALL = 1e-3;
+/** Share of the scan on the shape below which the page doubts that the model fits. */
+const MOST = 0.5;
 const KEPT = "Your shape stays as it was.";
 
 /**
@@ -77,13 +81,18 @@ export function fitInWords(answer, { file, model, diagonal }) {
       `(${readable(scan.mean)} units). 95 % of the points are closer than ${percent(scan.p95 / size)}.`,
     `${percent(explained)} of the scan lies on the shape. The scan covers ${percent(seen)} of the shape.`,
   ];
-  if (status === "deadline") words.push("For a better fit, use fewer points: a few thousand are enough.");
+  if (status === "deadline")
+    words.push(
+      explained < MOST
+        ? "Most of the scan lies off the shape. Perhaps it is no shape of this model."
+        : "For a better fit, use fewer points: a few thousand are enough.",
+    );
   if (status === "ambiguous") words.push(sentence(answer.reason));
   if (typeof mirrored === "number" && mirrored < 0.5) {
     words.push("The mirror image fits much better. Perhaps one axis of the file has the wrong sign.");
   }
   if (how === "poor") words.push(KEPT);
-  return { how, title, words, more: [place(placement), ...rest(back, size, noise)] };
+  return { how, title, words, more: [place(placement, size), ...rest(back, size, noise)] };
 }
 
 const rest = (back, size, noise) => [
@@ -94,9 +103,10 @@ const rest = (back, size, noise) => [
 /** Return the first sentence of a reason; the others are for programs. */
 const sentence = (reason) => `${reason.split(/\.\s/)[0].replace(/\.$/, "")}.`;
 
-function place({ rotation: [[a], [, b], [, , c]], translation, scale }) {
+function place({ rotation: [[a], [, b], [, , c]], translation, scale }, size) {
   const angle = (180 / Math.PI) * Math.acos(Math.min(Math.max((a + b + c - 1) / 2, -1), 1));
-  const to = translation.map((value) => readable(value).replace("-", "−")).join(", ");
+  const seen = (value) => (Math.abs(value) < SMALL * size ? 0 : value);
+  const to = translation.map((value) => readable(seen(value)).replace("-", "−")).join(", ");
   const times =
     Math.abs(scale - 1) < 1e-6 ? "in the model's units" : `${readable(scale)} times the model's size`;
   return `The file has it turned by ${angle.toFixed(0)}°, moved by (${to}), ${times}.`;

@@ -188,9 +188,13 @@ export async function shapes(model, latents, mesh, { quality = "full", signal } 
 /** Return the id and links of an animation. */
 export const interpolation = (model, path) => json(post(at(model, "interpolations"), path));
 
-/** Return the random code of a seed, from the population or uniform inside the bounds. */
+let drawing = new AbortController();
+/** Return the random code of a seed, from the population or uniform inside the bounds; cancels the last call. */
 export async function sample(model, seed, distribution) {
-  const { latents } = await json(post(at(model, "sample"), { count: 1, seed, distribution }));
+  drawing.abort(); // its answer may come later, and would replace this one
+  drawing = new AbortController();
+  const body = { count: 1, seed, distribution };
+  const { latents } = await json(post(at(model, "sample"), body, drawing.signal));
   return latents[0];
 }
 

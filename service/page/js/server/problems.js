@@ -61,6 +61,7 @@ export function inWords({ type = "", detail = "" }, status) {
   const kind = type.split(":").at(-1);
   const text = TEXTS[kind] ?? `The server answers with the status ${status}. ${RELOAD}`;
   const [first] = detail.split(/(?<=[.!])\s/);
-  const told = ABOUT_FILES.includes(kind) && first && !FOR_PROGRAMS.test(first);
-  return told ? `${first} ${text}` : text;
+  if (!ABOUT_FILES.includes(kind)) return text;
+  const why = first && !FOR_PROGRAMS.test(first) ? first : "The server can’t use this file.";
+  return `${why} ${text}`;
 }

@@ -76,6 +76,7 @@ export class Names {
     const { model } = this.store;
     const said = own(model);
     const short = labels(model);
+    const theirs = namesOf(model, {}, this.store.motions ?? undefined);
     const line = (key, name, shown, placeholder = shown) => {
       const input = element("input", {
         type: "text",
@@ -91,11 +92,11 @@ export class Names {
       ...model.factors.map((factor) => {
         const ks = model.latent_names
           .slice(factor.start, factor.stop)
-          .map((name, i) => [name, short[factor.start + i]]);
+          .map((name, i) => [name, short[factor.start + i], factor.start + i]);
         // A factor with one coordinate shares its name, and has one field.
         const parts = ks
           .filter(([, label]) => label)
-          .map(([name, label]) => line(`coordinate ${name}`, name, label));
+          .map(([name, , k]) => line(`coordinate ${name}`, theirs.coordinates[k], theirs.labels[k]));
         return element(
           "fieldset",
           {},

@@ -107,7 +107,8 @@ export class Files {
       if (base) query.set("against", rounded(base));
     }
     const latent = rounded(code);
-    return { path: `${model.links.mesh}?${query}`, body: fine ? { latent } : { latent, mesh: "coarse" } };
+    const path = `${model.links.mesh}?${query}`.replaceAll("%2C", ",");
+    return { path, body: fine ? { latent } : { latent, mesh: "coarse" } };
   }
 
   #tell() {
