@@ -80,8 +80,12 @@ The ratio is to components with images. Coarse meshes differ from those in the f
 """
 #: A ratio below this is a clear gain.
 PAYS = 0.7
-#: Simple models beside principal components.
-SIMPLE = ("remembering_components", "linear_nric", "differential_coordinates")
+#: Simple models beside principal components, and their names on pages.
+SIMPLE = {
+    "remembering_components": "components with memory",
+    "linear_nric": "straight lines of lengths and angles",
+    "differential_coordinates": "differential coordinates",
+}
 #: Rows of the table.
 ROWS = tuple(
     name + ending for name in (*COLLECTIONS, MANNEQUIN) for ending in ("", MIRRORED) if name in SYMMETRIC or not ending
@@ -224,7 +228,7 @@ def write_page() -> None:
         collections="" if simple.keys() == plain.keys() else f"We measured this for {', '.join(simple)} only.",
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in done)),
         simple=pages.table(
-            ("", "modes", "components with memory", "straight lines of lengths and angles", "differential coordinates"),
+            ("", "modes", *SIMPLE.values()),
             (row for name, found in simple.items() for row in simple_rows(name, found)),
         ),
         plain=pages.table(

@@ -1,9 +1,10 @@
-"""docs/measurements/served.md: distance of served models from unseen shapes, next to principal components.
+"""docs/measurements/served.md: distance of served models from unseen shapes, next to simple models.
 
 ``python -m benchmarks.served --data FOLDER`` trains a model on four fifths of each collection and exports it. Its
 ``encode`` then finds the codes of the other fifth and of the training shapes. Then follows a model without the next
-fifth, until each fifth was held out once, or ``--folds`` of them. Results are kept under ``--out``, so a killed call
-can be continued. ``python -m benchmarks.fit --data OUT/models`` fits scans of the first fifth.
+fifth, until each fifth was held out once, or ``--folds`` of them. Results are kept under
+``--out``, so a killed call can be continued. A row keeps no fold of another version. ``python -m benchmarks.fit
+--data OUT/models`` fits scans of the first fifth.
 """
 
 import argparse
@@ -14,13 +15,12 @@ import numpy as np
 import tomlkit
 
 from benchmarks import pages
-from benchmarks.generalisation import ROWS
+from benchmarks.generalisation import SIMPLE
 from benchmarks.pages import ROOT, table
-from benchmarks.results import MIRRORED, open_run
+from benchmarks.results import COLLECTIONS, MANNEQUIN, open_run
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
-from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.runs.config import parse
 from shapespace.training.space.generalisation import (
     FOLDS,
@@ -31,6 +31,7 @@ from shapespace.training.space.generalisation import (
     to_nearest,
     vertex_distances,
 )
+from shapespace.training.space.held_out import simple_models
 from shapespace.training.stages.export import write_bundle_of
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run, read_meshes
@@ -43,9 +44,9 @@ WITHOUT_EXAMPLES = "nothing remembered"
 #: Ending of the names of runs with half as many modes.
 HALF = "-half"
 #: Models, in the order of the rows.
-NAMES = tuple(each + ending for each in ROWS for ending in ("", HALF))
-#: A ratio below this is a clear gain.
-PAYS = 0.7
+NAMES = tuple(each + ending for each in (*COLLECTIONS, MANNEQUIN) for ending in ("", HALF))
+#: A share of the best simple model's error: below it a model is clearly better.
+CLEARLY = 0.9
 #: Stored figures, one file for each row; a stored fold is not measured again.
 FIGURES = ROOT / "runs" / "collections"
 
@@ -53,34 +54,37 @@ PAGE = """# Errors on unseen shapes
 
 How near does a model come to a shape that it has never seen? [Is it for my data?](../is-it-for-me.md) has the
 summary. Errors are mean distances of vertices in percent of the [diagonal](../reference/glossary.md#diagonal); after
-the slash stands the 95th percentile. Each collection also has a model with half of its modes. {measured}
+the slash stands the 95th percentile. Each collection also has a model with half of its modes. A run chooses its
+[map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. {measured}
 
 ## Unseen shapes
 
-For {better}, our error is {gain} of the error of as many principal components. For the other collections with all
-their modes it is {rest}.
+{finding}
 
 {unseen}
 
-The [ratio](../reference/glossary.md#ratio) has the smallest and the largest ratio of a
-[fold](../reference/glossary.md#fold) in brackets. The last column is the ratio of the same model without its
-[memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`). Memory helps most with
-faces and the dancer (samba). Each fold of makehuman trains on 35 or 36 shapes, which limits its modes.
+The [ratio](../reference/glossary.md#ratio) is to as many principal components, with the smallest and the largest
+ratio of a [fold](../reference/glossary.md#fold) in brackets. Then follows our error as a share of the best simple
+model's error. Each fold of makehuman trains on 35 or 36 shapes, which limits its modes.{incomplete}
 
-With [mirror images](../reference/glossary.md#mirror-image) of the training shapes, faces have a ratio of {images}
-without memory. Components that know these images too are as good.
+## Simple models
+
+{simplest}
+
+{simple}
+
+All figures are errors as shares of the error of principal components, on the same meshes. The first column is our
+model without its [memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`).
 
 ## Training shapes
 
-Users get their own shapes back almost exactly. This comes from the memory, not from better modes, as the last column
-shows.
+Users get their own shapes back almost exactly. This comes from the memory, as the last column shows.
 
 {known}
 
 ## Random shapes
 
-Random shapes of our models look more like the collection than random shapes of components. The exception is the
-dancer.
+Smaller is better: random shapes then look more like shapes of the collection.
 
 {first}
 
@@ -93,7 +97,8 @@ drawn evenly from the bounds, in the first fold.
   Settings come from `examples/collections/`, without mirror images.
 - Networks learned from at most {joint} [joint](../reference/glossary.md#joint-code) samples and {factors} of each
   factor.
-- `encode` of the exported model got the fine meshes. Components come from the fine meshes of the same four fifths.
+- `encode` of the exported model got the fine meshes. Simple models come from the fine meshes of the same four fifths.
+  All find codes by vertices.
 - No fold chose by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with some of them in view.
 - `python -m benchmarks.served --data FOLDER` trains, measures and writes this page. Figures are in
@@ -104,20 +109,21 @@ drawn evenly from the bounds, in the first fold.
 def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, FloatArray, FloatArray]:
     """Return the run of a collection without one fold, its fine training meshes (n, V, 3), and the held-out meshes.
 
-    A name that ends in ``HALF`` gets half as many modes; ``MIRRORED`` before that adds mirror images.
+    A name that ends in ``HALF`` gets half as many modes.
     """
     example = open_run(name.removesuffix(HALF), data, out)
     meshes = read_meshes(example.config)
     held = folds(len(meshes.names))[fold]
     known, names = (np.delete(array, held, axis=0) for array in (meshes.vertices, np.array(meshes.names)))
     ending = f"-fold-{fold}" if fold else ""
-    file = out / "data" / f"{name.removesuffix(HALF).removesuffix(MIRRORED)}{ending}.npz"
+    file = out / "data" / f"{name.removesuffix(HALF)}{ending}.npz"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         np.savez(file, vertices=known, faces=meshes.faces, names=names)
     document: Any = tomlkit.parse(example.source)
     document["collection"].pop("generator", None)
     document["collection"]["data"] = str(file.resolve())
+    document["modes"]["geometry"] = "auto"  # as `init` writes it
     if name.endswith(HALF):
         document["modes"]["count"] = -(-document["modes"]["count"] // 2)
     joint, factors = example.config.samples.count, example.config.samples.factor_counts
@@ -146,16 +152,16 @@ def without_examples(run: Run) -> ShapeModel:
     return load(other.bundle if other.bundle.exists() else write_bundle_of(other, figures={}))
 
 
-def with_images(known: FloatArray, model: ShapeModel) -> PrincipalComponents:
-    """Return components of shapes (n, V, 3) and their mirror images.
-
-    Raises:
-        ValueError: none of the shapes is symmetric.
-    """
-    symmetric = find_mirror(known, TriangleMesh.from_arrays(known[0], model.faces).edges)
-    if symmetric is None:
-        raise ValueError("none of the shapes is symmetric")
-    return PrincipalComponents.of(np.concatenate([known, mirrored(known, symmetric[0])[0]]), model.vertices)
+def simple(known: FloatArray, unseen: FloatArray, model: ShapeModel) -> dict[str, dict[str, float]]:
+    """Return figures of the simple models of the known shapes (n, V, 3), with as many coordinates as a model."""
+    reference = TriangleMesh.from_arrays(model.vertices, model.faces)
+    size = float(diagonal(model.vertices))
+    models = simple_models(reference, known, np.ones(len(known), dtype=bool))
+    return {
+        kind: summary(vertex_distances(models[kind](unseen, model.dimension), unseen, size))
+        for kind in SIMPLE
+        if kind in models
+    }
 
 
 def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
@@ -165,7 +171,7 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     model = load(run.bundle if run.bundle.exists() else write_bundle_of(run, figures={}))
     m, size = model.dimension, float(diagonal(model.vertices))
     linear, without = PrincipalComponents.of(known, model.vertices), without_examples(run)
-    found: dict[str, Any] = {"modes": m}
+    found: dict[str, Any] = {"modes": m, "map": run.directory.geometry.read().get("kind", "exponential")}
     for kind, shapes in zip(COLUMNS, (unseen, known), strict=True):
         others = vertex_distances(linear.nearest(shapes, m), shapes, size)
         found[kind] = summary(encoded(model, shapes)) | {
@@ -173,12 +179,10 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
             WITHOUT_EXAMPLES: summary(encoded(without, shapes)),
             "shapes": len(shapes),
         }
+    found[COLUMNS[0]] |= simple(known, unseen, model)
     if fold:
         return found
     np.savez(out / "models" / f"{name}.npz", vertices=unseen)
-    if name.removesuffix(HALF).endswith(MIRRORED):
-        others = vertex_distances(with_images(known, model).nearest(unseen, m), unseen, size)
-        found["mirrored_components"] = summary(others)
     drawn = np.stack([model.decode(code) for code in model.sample(RANDOM, 0)])
     others = linear.random(m, RANDOM, np.random.default_rng(0))
     return found | {"specificity": [to_nearest(each, known, size) for each in (drawn, others)]}
@@ -206,6 +210,51 @@ def ratio(folds: list[dict[str, Any]], model: str | None = None) -> str:
     return f"{mean / components:.2f}" + (f" ({each.min():.2f}–{each.max():.2f})" if folds[1:] else "")
 
 
+def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
+    """Return the key of the best simple model, and the share of its error that ours is; None if unmeasured."""
+    measured = [kind for kind in SIMPLE if all(kind in fold for fold in folds)]
+    if not measured:
+        return None
+    weights = [fold["shapes"] for fold in folds]
+    means = {
+        kind: float(np.average([(fold[kind] if kind else fold)["mean"] for fold in folds], weights=weights))
+        for kind in ("", "components", *measured)
+    }
+    own = means.pop("")
+    best = min(means, key=lambda kind: means[kind])
+    return best, own / means[best]
+
+
+def finding(shares: dict[str, float]) -> str:
+    """Say for which rows the model is clearly better than the best simple model, from its share of the error."""
+    if not shares:
+        return ""
+    better = {name: share for name, share in shares.items() if share <= CLEARLY}
+    rest = {name: share for name, share in shares.items() if name not in better}
+
+    def said(some: dict[str, float]) -> str:
+        return ", ".join(f"{name} ({share:.2f})" for name, share in some.items())
+
+    sentences = []
+    if better:
+        sentences.append(f"Our error is clearly below the error of the best simple model for {said(better)}.")
+    if rest:
+        sentences.append(f"It is about as large, or larger, for {said(rest)}." if better else f"None: {said(rest)}.")
+    return "\n".join(sentences)
+
+
+def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
+    """Say which rows don't have all folds, and which were measured before runs chose their map."""
+    few: dict[int, list[str]] = {}
+    for name, found in rows.items():
+        if len(found) < FOLDS:
+            few.setdefault(len(found), []).append(name)
+    said = [f"\n{', '.join(names)}: only {count} of {FOLDS} folds." for count, names in few.items()]
+    if not all("map" in fold for found in rows.values() for fold in found):
+        said.append("\nRows without a last figure are older: exponentials were the only map then.")
+    return "".join(said)
+
+
 def main() -> None:
     """Measure and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -216,11 +265,10 @@ def main() -> None:
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
-        found = pages.read_figures(file) if file.exists() else []
-        for fold in range(given.folds):
-            if fold < len(found) and "mean" in found[fold][COLUMNS[0]]:
-                continue
-            found[fold : fold + 1] = [measure(name, given.data, given.out, fold)]
+        stored = pages.read_figures(file) if file.exists() else []
+        found = [fold for fold in stored if "map" in fold]
+        for fold in range(len(found), given.folds):
+            found.append(measure(name, given.data, given.out, fold))
             pages.write_figures(file, found)
             write_page()
 
@@ -229,26 +277,30 @@ def write_page() -> None:
     """Write the page from all stored figures."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
     rows = {name: pages.read_figures(file) for name, file in files.items() if file.exists()}
-    images = ratio([fold["unseen"] for fold in rows.pop("faces" + MIRRORED)], WITHOUT_EXAMPLES).split()[0]
-    tables: dict[str, list[list[str]]] = {"unseen": [], "known": [], "first": []}
-    whole: dict[str, str] = {}
+    tables: dict[str, list[list[str]]] = {"unseen": [], "simple": [], "known": [], "first": []}
+    shares: dict[str, float] = {}
+    rivals: dict[str, list[str]] = {}
     for name, found in rows.items():
         modes = [fold["modes"] for fold in found]
         count = " – ".join(map(str, sorted({min(modes), max(modes)})))
         title = f"{name.removesuffix(HALF)}, {count} modes"
         unseen, known = ([fold[kind] for fold in found] for kind in COLUMNS)
-        alone = ratio(unseen, WITHOUT_EXAMPLES).partition(" (")[0]
-        tables["unseen"].append([title, average(unseen), average(unseen, "components"), ratio(unseen), alone])
+        maps = ", ".join(sorted({fold.get("map", "exponential") for fold in found}))
+        tables["unseen"].append([title, maps, average(unseen), ratio(unseen)])
+        if best := best_simple(unseen):
+            rival, shares[title] = SIMPLE.get(best[0], best[0]), best[1]
+            rivals.setdefault(rival, []).append(title)
+            tables["unseen"][-1].append(f"{shares[title]:.2f} ({rival})")
+            others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
+            tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
         if name.endswith(HALF):
             continue
-        whole[name] = ratio(unseen).split()[0]
         alone = average(known, WITHOUT_EXAMPLES, ("mean",))
         tables["known"].append([title, average(known), average(known, "components"), alone])
         tables["first"].append([title, *(f"{100 * figure:.2f}" for figure in found[0]["specificity"])])
-    better = {name: found for name, found in whole.items() if float(found) < PAYS}
-    rest = [found for name, found in whole.items() if name not in better]
     heads = {
-        "unseen": ("our error", "components", "ratio", "ratio without memory"),
+        "unseen": ("map", "our error", "ratio", "to the best simple model"),
+        "simple": ("ours without memory", *SIMPLE.values()),
         "known": ("our error", "components", "ours without memory"),
         "first": ("our random shapes", "of components"),
     }
@@ -256,10 +308,9 @@ def write_page() -> None:
         joint=JOINT,
         factors=OF_FACTORS,
         codes=RANDOM,
-        better=" and ".join(", ".join(better).rsplit(", ", 1)),
-        gain=f"{min(better.values())} to {max(better.values())}",
-        rest=f"{min(rest)} to {max(rest)}",
-        images=images,
+        finding=finding(shares),
+        simplest=" ".join(f"The best simple model is {rival} for {'; '.join(some)}." for rival, some in rivals.items()),
+        incomplete=incomplete(rows),
         measured=pages.measured_with(*(files[name] for name in rows)),
         **{kind: table(("", *heads[kind]), cells) for kind, cells in tables.items()},
     )

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks import pages
+from benchmarks.generalisation import SIMPLE
 from benchmarks.pages import ROOT
 
 RUNS, PAGE, CHART = ROOT / "runs", ROOT / "docs" / "is-it-for-me.md", ROOT / "docs" / "is-it-for-me.svg"
@@ -92,7 +93,9 @@ def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
         components=mean([fold[COMPONENTS] for fold in unseen]),
     )
     simple = set.intersection(*(set(fold) for fold in unseen)) - {*OURS, COMPONENTS}
-    found.ratios = {rival: mean([fold[rival] for fold in unseen]) / found.components for rival in simple}
+    found.ratios = {
+        SIMPLE.get(rival, rival): mean([fold[rival] for fold in unseen]) / found.components for rival in sorted(simple)
+    }
     if (file := runs / "folds" / f"{name}-mirrored.json").exists():
         mirrored = pages.read_figures(file)
         found.ratios[WITH_IMAGES] = mirrored["mirrored_components"][-1]["mean"] / mirrored["components"][-1]["mean"]

@@ -28,7 +28,7 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import Codes, ShapeMap, exponential_map, nearest_codes
 from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
-from shapespace.training.space.geometry import GeometryChoice, choose_geometry
+from shapespace.training.space.geometry import GeometryChoice, Kind, choose_geometry
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
@@ -45,6 +45,7 @@ class HeldOut:
     # (k, V, 3) for each number: ``modes`` has the nearest shapes of the space. The simple models follow. Where there
     # are mirror images, ``components`` don't know them, but ``mirrored_components`` and the other models do
     near: dict[str, list[FloatArray]]
+    maps: tuple[Kind, ...]  # (k,) the map from codes to shapes
     steps: IntArray  # (k,) K of the exponentials, 1 for straight lines
     # (k,) for each number: whether the search did not converge, because faces of exponentials collapse
     stuck: list[NDArray[np.bool_]]
@@ -69,6 +70,7 @@ def joined(parts: Sequence[HeldOut]) -> HeldOut:
             for kind in parts[0].near
             if all(kind in part.near for part in parts)
         },
+        maps=tuple(kind for part in parts for kind in part.maps),
         steps=np.concatenate([part.steps for part in parts]),
         stuck=together(part.stuck for part in parts),
     )
@@ -124,7 +126,8 @@ def held_out(
         for kind, nearest in rivals.items():
             near[kind].append(nearest(unseen, reached[-1]))
         near["modes"].append(found.vertices)
-    return HeldOut(index, reached, near, np.full(len(index), choice.light_steps), stuck)
+    maps = (choice.kind,) * len(index)
+    return HeldOut(index, reached, near, maps, np.full(len(index), choice.light_steps), stuck)
 
 
 #: Map from shapes (k, V, 3) and a number of coordinates to the nearest shapes (k, V, 3) of a simple model.

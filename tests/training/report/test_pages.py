@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bundled, fit, generalisation, pages, results, served, stages, verdict
+from benchmarks import bundled, few_shapes, fit, generalisation, pages, results, served, stages, verdict
 from shapespace.training.report.number_format import r2, short_of
 from shapespace.training.runs.provenance import made_by
 
 WRITERS: dict[str, Callable[[], None]] = {
     "bundled": lambda: pages.write("bundled", bundled.page()),
+    "few-shapes": few_shapes.write_page,
     "fit": fit.write_page,
     "generalisation": generalisation.write_page,
     "growth": stages.write_page,
@@ -84,3 +85,33 @@ def test_a_simple_model_that_is_measured_later_is_in_the_verdict(tmp_path: Path)
     chart = tmp_path / "chart.svg"
     verdict.draw(found, chart)
     assert ">0.25</text>" in chart.read_text(encoding="utf-8")
+
+
+def test_the_best_simple_model_is_the_rival_of_a_row() -> None:
+    def fold(own: float, lines: float, shapes: int) -> dict[str, object]:
+        others = {"components": {"mean": 0.05}, "linear_nric": {"mean": lines}}
+        return others | {"mean": own, "shapes": shapes}
+
+    folds = [fold(0.01, 0.02, 1), fold(0.03, 0.04, 3)]
+    rival, share = served.best_simple(folds) or ("", 0.0)
+    assert rival == "linear_nric"
+    assert share == pytest.approx(0.025 / 0.035)
+    assert served.best_simple([{"mean": 0.01, "shapes": 1, "components": {"mean": 0.05}}]) is None, "an older row"
+    assert "below the error of the best simple model for hand (0.71)" in served.finding({"hand": share})
+    assert "None: faces (1.00)" in served.finding({"faces": 1.0})
+
+
+def test_draws_of_as_many_shapes_are_one_row_of_their_means() -> None:
+    def drawn(count: int, own: float, components: float) -> dict[str, object]:
+        row: dict[str, object] = {"name": "hand", "shapes": count, "modes_count": 3, "map": "nric"}
+        return row | {"modes": {"mean": own}, "components": {"mean": components}}
+
+    found = few_shapes.means([drawn(10, 0.01, 0.02), drawn(5, 0.03, 0.04), drawn(5, 0.05, 0.06)])
+    assert [(key, row["modes"]) for key, row in found.items()] == [
+        (("hand", 5), pytest.approx(0.04)),
+        (("hand", 10), 0.01),
+    ]
+    assert few_shapes.simplest(found["hand", 5]) == ("components", pytest.approx(0.05))
+    said = few_shapes.finding(found)
+    assert "hand 75 %" in said, "from 0.04 to 0.01 with one doubling"
+    assert "hand 0.50" in said
