@@ -286,11 +286,11 @@ def write_page() -> None:
         title = f"{name.removesuffix(HALF)}, {count} modes"
         unseen, known = ([fold[kind] for fold in found] for kind in COLUMNS)
         maps = ", ".join(sorted({fold.get("map", "exponential") for fold in found}))
-        tables["unseen"].append([title, maps, average(unseen), ratio(unseen)])
+        tables["unseen"].append([title, maps, average(unseen), ratio(unseen), ""])
         if best := best_simple(unseen):
             rival, shares[title] = SIMPLE.get(best[0], best[0]), best[1]
             rivals.setdefault(rival, []).append(title)
-            tables["unseen"][-1].append(f"{shares[title]:.2f} ({rival})")
+            tables["unseen"][-1][-1] = f"{shares[title]:.2f} ({rival})"
             others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
             tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
         if name.endswith(HALF):

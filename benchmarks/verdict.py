@@ -29,7 +29,8 @@ TITLES = {
     "samba": "a captured dancer",
     "hippocampus": "hippocampi",
 }
-#: A model pays for its training if it has less than this share of the error of the best simple model.
+#: A model pays for its training if it has less than this share of the error of principal components, and less than
+#: the error of every simple model.
 PAYS = 0.7
 #: Figures beside the errors of simple models in a fold: our own errors, and the number of shapes.
 OURS = ("mean", "p95", "shapes", "nothing remembered")
@@ -67,8 +68,8 @@ class CollectionErrors:
 
     @property
     def pays(self) -> bool:
-        """Whether the model is clearly better than every simple model."""
-        return self.ratio < PAYS * min([1.0, *self.ratios.values()])
+        """Whether the model is clearly better than principal components, and better than every simple model."""
+        return self.ratio < min([PAYS, *self.ratios.values()])
 
     @property
     def best(self) -> str | None:
@@ -87,7 +88,7 @@ def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
 
     found = CollectionErrors(
         name,
-        shapes=sum(shapes),
+        shapes=sum(folds[0][kind]["shapes"] for kind in ("unseen", "trained on")),
         modes=max(fold["modes"] for fold in folds),
         error=mean(unseen),
         components=mean([fold[COMPONENTS] for fold in unseen]),
@@ -99,7 +100,7 @@ def collection(name: str, runs: Path = RUNS) -> CollectionErrors:
     if (file := runs / "folds" / f"{name}-mirrored.json").exists():
         mirrored = pages.read_figures(file)
         found.ratios[WITH_IMAGES] = mirrored["mirrored_components"][-1]["mean"] / mirrored["components"][-1]["mean"]
-    found.ratios = {rival: ratio for rival, ratio in found.ratios.items() if ratio < 1}
+    found.ratios = {rival: ratio for rival, ratio in found.ratios.items() if round(ratio, 2) < 1}
     return found
 
 
