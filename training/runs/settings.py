@@ -255,8 +255,8 @@ class ExportSettings(SettingsTable):
     up: Axis = "+y"
     """The axis that points to the body's head. Needs ``faces``."""
     names: dict[str, str] = {}
-    """New names by the name in the report: ``{"upper right bends" = "left arm"}``. Coordinates follow their factor unless
-    they have names of their own here."""
+    """New names by the name in the report: ``{"upper right bends" = "left arm"}``. Coordinates follow their factor
+    unless they have names of their own here."""
 
     @property
     def key(self) -> dict[str, Any]:
