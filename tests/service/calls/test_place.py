@@ -100,11 +100,11 @@ def test_bad_places_are_told_what_to_do(client: httpx.Client) -> None:
     for place, says in (
         ("{", "place is not JSON"),
         ("[]", "place"),
-        ('{"rotation": [[1, 0, 0], [0, 1, 0]]}', "at least 3"),
+        ('{"rotation": [[1, 0, 0], [0, 1, 0]]}', "3 or more"),
         ('{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}', "rotation is not a rotation"),
         ('{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}', "rotation is not a rotation"),
         ('{"rotation": [[1, 0, 0], [0, 1, 0], [0, 1e308, -1e308]]}', "rotation is not a rotation"),
-        ('{"translation": [0, 0]}', "at least 3"),
+        ('{"translation": [0, 0]}', "3 or more"),
         ('{"translation": [0, 0, NaN]}', "finite"),
         ('{"translation": [0, 0, 1e300]}', "overflow"),
         ('{"scale": 0}', "scale"),

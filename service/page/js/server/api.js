@@ -189,7 +189,7 @@ export async function shapes(model, latents, mesh, { quality = "full", signal } 
 export const interpolation = (model, path) => json(post(at(model, "interpolations"), path));
 
 let drawing = new AbortController();
-/** Return the random code of a seed, from the population or uniform inside the bounds; cancels the last call. */
+/** Return the random code of a seed, from the population or uniform in the bounds; cancels the last call. */
 export async function sample(model, seed, distribution) {
   drawing.abort(); // its answer may come later, and would replace this one
   drawing = new AbortController();

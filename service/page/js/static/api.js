@@ -99,7 +99,8 @@ export async function sample(_model, seed, distribution) {
 export async function file(path, body) {
   if (!path || !body) return refuse("An animation file");
   const { shapes: found } = await shapes(await card(), [body.latent], "fine", { quality: "draft" });
-  const { withPositions } = await import("./glb.js"); // with three.js, for which the first requests don't wait
+  // With three.js, for which the first requests don't wait.
+  const { withPositions } = await import("./glb.js");
   return new Blob([withPositions(await textured(), found[0])], { type: "model/gltf-binary" });
 }
 
