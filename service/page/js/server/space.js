@@ -24,7 +24,7 @@ export class LatentSpace {
     return code.map((value, k) => this.wrap(k, value));
   }
 
-  /** Return a code inside the bounds: coordinates outside move to the nearer bound, in the address's digits. */
+  /** Return a code inside the bounds: others move to the nearer bound, with an address's digits. */
   clampAll(code) {
     return this.wrapAll(code).map((value, k) => {
       const low = Math.ceil(1e5 * this.lower[k]) / 1e5;
