@@ -15,13 +15,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks import pages
-from benchmarks.generalisation import SIMPLE, read_shapes
+from benchmarks.generalisation import SIMPLE, ingested, read_shapes
 from benchmarks.pages import ROOT, table
-from benchmarks.results import open_run
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.generalisation import summary
 from shapespace.training.space.held_out import held_out
-from shapespace.training.stages.ingest import ingest
 
 #: Stored figures, one row for each draw.
 FIGURES = ROOT / "runs" / "few-shapes.json"
@@ -69,12 +67,8 @@ PAGE = """# How many shapes do you need?
 
 def measure(name: str, data: Path, out: Path, count: int, draw: int) -> dict[str, Any] | None:
     """Return the figures of one draw of ``count`` shapes; None if the collection has too few."""
-    opened = open_run(name, data, out)
-    run = opened.directory
-    if not run.shapes.exists():
-        run.folder.mkdir(parents=True, exist_ok=True)
-        ingest(opened)
-    reference, shapes, *_ = read_shapes(run)
+    opened = ingested(name, data, out)
+    reference, shapes, *_ = read_shapes(opened.directory)
     order = np.random.default_rng(0).permutation(len(shapes))
     unseen, others = order[:UNSEEN], order[UNSEEN:]
     if len(others) < count:

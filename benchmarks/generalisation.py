@@ -22,6 +22,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.generalisation import LIGHT_STEPS, folds, summary, vertex_distances
 from shapespace.training.space.held_out import held_out, simple_models
 from shapespace.training.stages.ingest import ingest
+from shapespace.training.stages.stage import Run
 
 #: Stored figures, one file for each collection.
 FIGURES = ROOT / "runs" / "folds"
@@ -92,13 +93,19 @@ ROWS = tuple(
 )
 
 
+def ingested(name: str, data: Path, out: Path) -> Run:
+    """Return the run of a collection, with its shapes."""
+    opened = open_run(name, data, out)
+    if not opened.directory.shapes.exists():
+        opened.directory.folder.mkdir(parents=True, exist_ok=True)
+        ingest(opened)
+    return opened
+
+
 def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     """Return figures of a collection by number of coordinates, over all shapes, each from the fold that held it out."""
-    opened = open_run(name, data, out)
+    opened = ingested(name, data, out)
     run, config = opened.directory, opened.config
-    if not run.shapes.exists():
-        run.folder.mkdir(parents=True, exist_ok=True)
-        ingest(opened)
     reference, shapes, original, own = read_shapes(run)
     m = config.modes.count
     counts = None if m == "auto" else [-(-m // 2), m]
@@ -136,11 +143,7 @@ def read_shapes(run: RunDirectory) -> tuple[TriangleMesh, FloatArray, IntArray, 
 
 def measure_simple(name: str, data: Path, out: Path, counts: list[float]) -> dict[str, Any]:
     """Return figures of simple models of a collection, by number of coordinates, in the same folds and meshes."""
-    opened = open_run(name, data, out)
-    run = opened.directory
-    if not run.shapes.exists():
-        run.folder.mkdir(parents=True, exist_ok=True)
-        ingest(opened)
+    run = ingested(name, data, out).directory
     reference, shapes, original, own = read_shapes(run)
     every = []
     for k, index in enumerate(folds(len(own))):

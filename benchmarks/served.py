@@ -188,15 +188,17 @@ def measure(name: str, data: Path, out: Path, fold: int) -> dict[str, Any]:
     return found | {"specificity": [to_nearest(each, known, size) for each in (drawn, others)]}
 
 
+def over_shapes(folds: list[dict[str, Any]], model: str | None = None, key: str = "mean") -> float:
+    """Return a figure as a mean over all shapes: of the model, or of another in the same folds."""
+    figures = [(fold[model] if model else fold)[key] for fold in folds]
+    return float(np.average(figures, weights=[fold["shapes"] for fold in folds]))
+
+
 def average(folds: list[dict[str, Any]], model: str | None = None, keys: tuple[str, ...] = ("mean", "p95")) -> str:
     """Return a cell with means over all shapes: of the model, of another in the same folds, or nothing."""
-    some = [fold[model] if model else fold for fold in folds]
-    if "mean" not in some[0]:
+    if "mean" not in (folds[0][model] if model else folds[0]):
         return ""
-    weights = [fold["shapes"] for fold in folds]
-    return "\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}".join(
-        f"{100 * np.average([each[key] for each in some], weights=weights):.3f}" for key in keys
-    )
+    return "\N{NO-BREAK SPACE}/\N{NO-BREAK SPACE}".join(f"{100 * over_shapes(folds, model, key):.3f}" for key in keys)
 
 
 def ratio(folds: list[dict[str, Any]], model: str | None = None) -> str:
@@ -205,9 +207,10 @@ def ratio(folds: list[dict[str, Any]], model: str | None = None) -> str:
     if "mean" not in some[0]:
         return ""
     found = np.array([(each["mean"], fold["components"]["mean"]) for each, fold in zip(some, folds, strict=True)])
-    mean, components = np.average(found, axis=0, weights=[fold["shapes"] for fold in folds])
     each = found[:, 0] / found[:, 1]
-    return f"{mean / components:.2f}" + (f" ({each.min():.2f}–{each.max():.2f})" if folds[1:] else "")
+    return f"{over_shapes(folds, model) / over_shapes(folds, 'components'):.2f}" + (
+        f" ({each.min():.2f}–{each.max():.2f})" if folds[1:] else ""
+    )
 
 
 def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
@@ -215,14 +218,9 @@ def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
     measured = [kind for kind in SIMPLE if all(kind in fold for fold in folds)]
     if not measured:
         return None
-    weights = [fold["shapes"] for fold in folds]
-    means = {
-        kind: float(np.average([(fold[kind] if kind else fold)["mean"] for fold in folds], weights=weights))
-        for kind in ("", "components", *measured)
-    }
-    own = means.pop("")
+    means = {kind: over_shapes(folds, kind) for kind in ("components", *measured)}
     best = min(means, key=lambda kind: means[kind])
-    return best, own / means[best]
+    return best, over_shapes(folds) / means[best]
 
 
 def finding(shares: dict[str, float]) -> str:

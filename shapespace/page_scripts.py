@@ -67,7 +67,7 @@ class _Parts:
         self._begun: set[str] = set()
 
     def added(self, path: str) -> Iterator[str]:
-        """Yield the statements of a module and its imports, except those that were there before."""
+        """Yield the statements of a module and its imports, except modules that are there already."""
         self._begun.add(path)
         text = (self._folder / path).read_text("utf-8")
         for match in [*_IMPORT.finditer(text), *_EXPORT_ALL.finditer(text)]:
