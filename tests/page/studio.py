@@ -87,9 +87,12 @@ class OpenPage:
         """The first value of `what` that is neither None nor False."""
         end = time.monotonic() + patience
         while (value := what()) is None or value is False:
-            assert time.monotonic() < end, "the condition did not become true in time"
+            assert time.monotonic() < end, f"not true in time: {self._said()}"
             self.page.wait_for_timeout(30)  # also processes the browser's events
         return value
+
+    def _said(self) -> list[str]:
+        return [*self.complaints, *self["#messages, #verdict"].all_text_contents()]
 
     def open(self, hash: str = "#model=with-fine") -> OpenPage:
         """Load the page and wait until its full shape is drawn."""

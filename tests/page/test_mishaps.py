@@ -1,13 +1,14 @@
 """The page with missing browser features, failing servers and unusual user input."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Route
 
 from tests.page.conftest import CHROMIUM, Open, Visit
-from tests.page.studio import OpenPage
+from tests.page.studio import Hold, OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
 from tests.service.watching import free_port
@@ -209,3 +210,18 @@ def test_a_browser_that_keeps_nothing_shows_the_page_all_the_same(window: Open) 
     studio["#keep-shape"].click()
     studio.eventually(lambda: "This browser lets the page keep nothing" in studio.messages)
     assert studio["#shelf input"].input_value() == "Shape 1"
+
+
+def test_a_model_left_and_opened_again_draws_its_pictures_once(window: Open) -> None:
+    studio = window().open("#model=figure")
+    held = Hold(studio.page, re.compile("with-fine/mesh.*mesh=fine"))
+    for address in ("#model=with-fine", "#model=figure", "#model=with-fine"):
+        studio.page.evaluate("hash => { location.hash = hash; }", address)
+        studio.eventually(lambda address=address: studio["#model"].input_value() == address[7:])  # type: ignore[misc]
+    studio.eventually(lambda: len(held.routes) == 2)
+    held.release()
+    studio.eventually(lambda: studio[".end canvas.drawn"].count() == 6)
+    studio.rest()
+    ends = [asked for asked in studio.asked if len(asked["latents"]) > 1 and len(asked["latents"][0]) == 3]
+    assert len(ends) == 2, "one call for each factor"
+    assert studio.messages == ""

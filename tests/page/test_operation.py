@@ -227,7 +227,7 @@ def test_axe_finds_no_fault(window: Open, look: str) -> None:
         if tab == "Files":
             scan = httpx.get(f"{studio.url}/v1/models/with-fine/mesh?latent=0.1,0,0.5&format=obj").content
             studio["#mesh-file"].set_input_files({"name": "a.obj", "mimeType": "model/obj", "buffer": scan})
-            studio.eventually(lambda: "code of a.obj" in studio["#verdict h2"].inner_text())
+            studio.eventually(lambda: "The shape of a.obj" in studio["#verdict h2"].inner_text())
         check(studio, tab)
 
 

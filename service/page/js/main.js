@@ -255,9 +255,9 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   const space = new LatentSpace(model);
   const wrapped = space.wrapAll(code ?? space.home);
   if (store.model) api.ask(model, wrapped); // the first model's answers are under way
-  opening = model;
+  opening = space;
   const coarse = await api.reference(model, "coarse");
-  if (opening !== model) return;
+  if (opening !== space) return; // the user may have left a model and come back to it
   picker.value = model.name;
   store.set({ shape: null, playing: false, placement: null, pins: [], hover: null });
   viewer.open(coarse);
@@ -285,7 +285,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   find("#canvas").setAttribute("aria-label", `${model.title}, the shape of the code that the sliders give`);
   document.title = `${model.title} · shapespace`;
   const fine = await api.reference(model, "fine");
-  if (store.model !== model) return;
+  if (store.space !== space) return;
   if (fine.vertices.length !== coarse.vertices.length) {
     viewer.addMesh("fine", fine);
     store.set({
@@ -300,7 +300,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
   if (model.surface?.materials.some(({ texture }) => texture)) {
     try {
       const skin = await Skin.of(await api.textured(model));
-      if (store.model !== model) skin.dispose();
+      if (store.space !== space) skin.dispose();
       else {
         viewer.dress(store.hasFine ? "fine" : "coarse", skin);
         store.set({ hasOwn: true });
@@ -309,7 +309,7 @@ async function openModel({ model, code, keyframes = [], locked, view, pins = [],
       // only the appearance is missing without it
       report(error);
     }
-    if (store.model !== model) return;
+    if (store.space !== space) return;
   }
   if (embedded) return;
   welcome.play();

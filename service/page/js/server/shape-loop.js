@@ -86,8 +86,9 @@ export class ShapeLoop {
   }
 
   #want(quality) {
-    const { model, code, placement } = this.store;
-    this.#wanted = { mesh: meshOf(this.store), quality, model, code, placement, began: performance.now() };
+    const { model, space, code, placement } = this.store;
+    const began = performance.now();
+    this.#wanted = { mesh: meshOf(this.store), quality, model, space, code, placement, began };
     if (!this.#current) this.#run();
   }
 
@@ -101,7 +102,7 @@ export class ShapeLoop {
         const { signal } = this.#current.abort;
         const { shapes, diagnostics } = await api.shapes(model, [code], mesh, { quality: wanted, signal });
         const { quality } = diagnostics;
-        if (model === this.store.model && !this.store.playing) {
+        if (asked.space === this.store.space && !this.store.playing) {
           const motion = motionOf(this.store, mesh, code, shapes[0]);
           await this.#show({ ...asked, quality, positions: shapes[0], motion, diagnostics });
         }

@@ -54,20 +54,23 @@ export class Welcome {
     this.#begun = true;
     const { store } = this;
     const { signal } = this.#touched;
-    const { code: home } = store;
+    const { code: home, space } = store;
     const keyframes = this.#keyframes();
     const ways = keyframes.length - 1;
     try {
       const times = Array.from({ length: FRAMES * ways + 1 }, (_, k) => k / FRAMES);
-      const reel = new Reel(store, store.space.along(keyframes, times), meshOf(store));
+      const reel = new Reel(store, space.along(keyframes, times), meshOf(store));
       signal.addEventListener("abort", () => reel.stop());
       await reel.reach(1);
       signal.throwIfAborted();
-      signal.addEventListener("abort", () => store.set({ playing: false, code: home }));
+      if (store.space !== space) return; // an address has opened another model
+      signal.addEventListener("abort", () => {
+        if (store.space === space) store.set({ playing: false, code: home });
+      });
       store.set({ playing: true });
       const began = performance.now();
       const step = (now) => {
-        if (signal.aborted) return;
+        if (signal.aborted || store.space !== space) return;
         const way = (Math.max(now - began, 0) / (1000 * PACE)) % ways;
         reel.show((Math.floor(way) + eased(way % 1)) / ways);
         requestAnimationFrame(step);

@@ -38,10 +38,15 @@ export class Modes {
     const surface = new Surface(coarse.faces, coarse.vertices.length / 3);
     this.#abort = new AbortController();
     const { signal } = this.#abort;
+    const shapesOf = async (codes) => {
+      const answer = await api.shapes(model, codes, "coarse", { signal });
+      signal.throwIfAborted(); // the page may have left the model after the answer had arrived
+      return answer;
+    };
     try {
       const {
         shapes: [home],
-      } = await api.shapes(model, [space.home], "coarse", { signal });
+      } = await shapesOf([space.home]);
       const rest = surface.measure(home);
       const residuals = [];
       const seen = []; // measures of motions, by coordinate
@@ -53,7 +58,7 @@ export class Modes {
           changes.push({ [k]: down }, { [k]: up });
         }
         const codes = changes.map((change) => space.homeBut(change));
-        const { shapes, diagnostics } = await api.shapes(model, codes, "coarse", { signal });
+        const { shapes, diagnostics } = await shapesOf(codes);
         residuals.push(diagnostics.residual);
         for (let k = factor.start; k < factor.stop; k += 1) {
           const [down, up] = shapes.splice(0, 2);
