@@ -15,8 +15,9 @@ def measure_generalisation(run: Run) -> None:
     """Write ``generalisation.json``: errors of modes and of principal components on shapes left out of training.
 
     A fifth of the shapes is left out of everything: mean, logarithms, modes and their number. Below ten shapes, each
-    shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The same is measured
-    with half as many modes. ``least-general.npz`` has the shape with the largest error.
+    shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The space remembers
+    the other shapes if the bundle does. The same is measured with half as many modes. ``least-general.npz`` has the
+    shape with the largest error.
     """
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
@@ -57,9 +58,11 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
 STAGE = Stage(
     name="generalisation",
     version=1,
-    # Exponentials are measured without memory. Runs of version 0.2 had nothing else, and keep their key.
+    # Runs of version 0.2, which had exponentials and remembered examples by default, keep their key.
     settings=lambda config: (
-        [] if config.modes.geometry == "exponential" else [config.export.model_dump(include={"examples"})]
+        []
+        if config.modes.geometry == "exponential" and config.export.examples
+        else [config.export.model_dump(include={"examples"})]
     ),
     run=measure_generalisation,
     results=lambda run: [run.generalisation.path, run.least_general.path],
