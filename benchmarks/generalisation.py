@@ -2,7 +2,7 @@
 
 Five folds of each collection have their own mean, logarithms and modes, for the number of modes in the example and for
 half of it. Exponentials replace networks. Finished folds are kept under ``--out``. A collection with five finished
-folds has its figures in ``runs/folds/``, and is not measured again.
+folds has its figures in ``runs/folds/``, and is not measured again. The row ``people`` needs the extra ``people``.
 """
 
 import argparse
@@ -15,11 +15,11 @@ import numpy as np
 from benchmarks import pages
 from benchmarks.differential_coordinates import DifferentialCoordinates
 from benchmarks.pages import ROOT
-from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, SYMMETRIC, open_run
+from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, PEOPLE, SYMMETRIC, open_run
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.generalisation import LIGHT_STEPS, folds, summary, vertex_distances
+from shapespace.training.space.generalisation import FOLDS, LIGHT_STEPS, folds, summary, vertex_distances
 from shapespace.training.space.held_out import held_out, simple_models
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
@@ -66,7 +66,7 @@ posed bodies (makehuman), modes stay better than components.
 
 The ratio is to components with images. Coarse meshes differ from those in the first table, so compare within a row.
 
-## How it was measured
+{people}## How it was measured
 
 - Five [folds](../reference/glossary.md#fold) leave each shape out once. Mean, logarithms and modes come from the other
   shapes. The error is the distance of the nearest exponential after rigid alignment.
@@ -78,6 +78,15 @@ The ratio is to components with images. Coarse meshes differ from those in the f
   there. [Networks](served.md) still give a shape, which is nearer.
 - `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles,
   are in `runs/folds/`.
+"""
+PEOPLE_PAGE = """## An unseen pose, an unseen body
+
+{finding} {bodies} adults stand in {poses} poses each. Without every fifth pose, or without every fifth person, a run
+chooses map and number of modes by itself. The generator `people` makes the
+[bodies](../how-to/collections.md#bodies-without-data-of-your-own).
+
+{rows}
+
 """
 #: A ratio below this is a clear gain.
 PAYS = 0.7
@@ -91,6 +100,8 @@ SIMPLE = {
 ROWS = tuple(
     name + ending for name in (*COLLECTIONS, MANNEQUIN) for ending in ("", MIRRORED) if name in SYMMETRIC or not ending
 )
+#: What is left out of the bodies of `PEOPLE`, and its position in the names of shapes.
+LEFT_OUT = {"pose": 1, "person": 0}
 
 
 def ingested(name: str, data: Path, out: Path) -> Run:
@@ -169,6 +180,52 @@ def measure_simple(name: str, data: Path, out: Path, counts: list[float]) -> dic
     }
 
 
+def measure_people(data: Path, out: Path) -> dict[str, Any]:
+    """Return figures of a run's own choice of map and modes, and of simple models, for unseen poses and persons."""
+    opened = ingested(PEOPLE, data, out)
+    run, config = opened.directory, opened.config
+    reference, shapes, _, _ = read_shapes(run)
+    # "person 3, pose 2" is 3, 2
+    numbers = np.array([[int(part.split()[1]) for part in name.split(", ")] for name in run.shapes.read()["names"]])
+    settings = config.modes.model_copy(update={"geometry": "auto"})
+    found: dict[str, Any] = dict(zip(("bodies", "poses"), numbers.max(axis=0).tolist(), strict=True))
+    for what, column in LEFT_OUT.items():
+        file = run.study(f"unseen-{what}")
+        if not file.exists():
+            index = np.flatnonzero(numbers[:, column] % FOLDS == 0)
+            part = held_out(reference, shapes, index, None, settings, config.shell_material)
+            away = part.distances(shapes, reference.diagonal)
+            file.write(
+                {"map": part.maps[0], "count": part.counts[-1], "shapes": len(index)}
+                | {kind: summary(each[-1]) for kind, each in away.items()}
+            )
+        found[what] = file.read()
+    return found
+
+
+def people_section(found: dict[str, Any]) -> str:
+    """Return the section about people."""
+    cells, ratios = [], []
+    for what in LEFT_OUT:
+        row = found[what]
+        shares = {kind: row[kind]["mean"] / row["components"]["mean"] for kind in ("modes", *SIMPLE) if kind in row}
+        ratios.append(f"{shares['modes']:.2f} for an unseen {what}")
+        best = min(SIMPLE, key=lambda kind: shares.get(kind, np.inf))
+        cells.append([
+            f"{what}: {row['shapes']} shapes, {row['count']:.0f} modes, `{row['map']}`",
+            f"{100 * row['modes']['mean']:.3f} %",
+            f"{100 * row['components']['mean']:.3f} %",
+            f"{shares['modes']:.2f}",
+            f"{shares[best]:.2f}, {SIMPLE[best]}",
+        ])  # fmt: skip
+    return PEOPLE_PAGE.format(
+        finding=f"The error is {' and '.join(ratios)}, as a share of the error of principal components.",
+        bodies=found["bodies"],
+        poses=found["poses"],
+        rows=pages.table(("unseen", "error", "of components", "ratio", "best simple model's ratio"), cells),
+    )
+
+
 def simple_rows(name: str, found: dict[str, Any]) -> list[list[str]]:
     """Return the rows of a collection: the error of each model as a share of the error of principal components."""
     title = f"{name}, K = {', '.join(map(str, found['steps']))}"
@@ -223,7 +280,9 @@ def write_page() -> None:
     ratios = {name: found["modes"][-1]["mean"] / found["components"][-1]["mean"] for name, found in plain.items()}
     better = {name: ratio for name, ratio in ratios.items() if ratio < PAYS}
     rest = [ratio for name, ratio in ratios.items() if name not in better]
+    people = FIGURES / f"{PEOPLE}.json"
     page = PAGE.format(
+        people=people_section(pages.read_figures(people)) if people.exists() else "",
         better=" and ".join(", ".join(better).rsplit(", ", 1)),
         gain=between(better.values()),
         rest=between(rest),
@@ -252,10 +311,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the collections")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "generalisation")
-    parser.add_argument("names", nargs="*", default=ROWS)
+    parser.add_argument("names", nargs="*", default=(*ROWS, PEOPLE))
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
+        if name == PEOPLE:
+            if not file.exists():
+                pages.write_figures(file, measure_people(given.data, given.out))
+            write_page()
+            continue
         if not file.exists():
             found = measure(name, given.data, given.out)
             pages.write_figures(file, found)

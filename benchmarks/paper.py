@@ -54,12 +54,12 @@ CHOSEN = Recipe(
     factors=PERCEPTRON,
     combiner=CombinerSettings(
         correction=ConvolutionSettings(
-            layers=3,
+            layers=4,
             width=48,
             edge_channels=0,
-            dropout=0.1,
+            dropout=0,
             normalisation="after",
-            fit=FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=2, max_epochs=7),
+            fit=FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=2, max_epochs=12),
         ),
         symmetries=False,
         eta=1e-2,
@@ -125,7 +125,7 @@ def main() -> None:
     systems = AS_CHOSEN if given.chosen else AS_GUESSED
     for name in given.names:
         record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
-        evaluation = json.loads((file if given.chosen and file.exists() else record / "evaluation.json").read_text())
+        evaluation = json.loads((file if file.exists() else record / "evaluation.json").read_text())
         config = record / "config.toml"
         measure(
             Run(given.out / name, *load(config, stored=config), given.out / "models"),

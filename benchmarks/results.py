@@ -45,6 +45,8 @@ SHELL, SHELL_MODES = "-shell", {"norm": "shell", "sparsity": 0.1, "log_steps": 1
 LARGEST = "hippocampus-80"
 #: The paper's largest experiment, on bodies of the built-in generator of this name.
 EXPRESSIVE = "expressive"
+#: The generator of bodies of several people.
+PEOPLE = "people"
 #: Collections of real meshes, in the order of the tables. Contrasts are the hand without sparse modes, with one factor
 #: and with the variants of the paper's outlook, the dancer from few samples, the largest runs, and runs with the
 #: paper's modes.
@@ -85,7 +87,11 @@ def open_run(name: str, data: Path, out: Path) -> Run:
     A name that ends in ``SHELL`` gets the paper's modes, without the paper's system and the grid.
     """
     plain = name.removesuffix(MIRRORED).removesuffix(SHELL)
-    path = ROOT / "examples" / (f"{plain}.toml" if plain in (MANNEQUIN, EXPRESSIVE) else f"collections/{plain}.toml")
+    path = (
+        ROOT
+        / "examples"
+        / (f"{plain}.toml" if plain in (MANNEQUIN, EXPRESSIVE, PEOPLE) else f"collections/{plain}.toml")
+    )
     meshes = load(path)[0].collection.data
     _, text = load(path, data / meshes.relative_to(path.parent) if meshes else None)
     document: Any = tomlkit.parse(text)
