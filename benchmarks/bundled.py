@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks import pages, served, studies
 from benchmarks.pages import ROOT
-from benchmarks.paper import AS_CHOSEN, AS_GUESSED
+from benchmarks.paper import SYSTEMS
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.training.collection.generators import freaky_torus
 from shapespace.training.learning.evaluation import r_squared
@@ -25,8 +25,8 @@ MODELS = {
     "composite": "**our model**",
     "monolithic": "our recipe, one factor",
     "kernel": "kernel ridge regression",
-    "paper": "the paper's own system",
-    "paper_chosen": "the paper's own system, sizes chosen here",
+    "paper": "the paper's own system, sizes chosen here",
+    "paper_guessed": "the paper's own system, sizes guessed",
     "monolithic_paper": "the paper's monolithic network",
     "monolithic_chosen": "the paper's monolithic network, sizes chosen here",
     "affine": "affine sum, exact factors",
@@ -52,11 +52,11 @@ def add_paper(found: dict[str, Any], again: dict[str, Any]) -> None:
     """
     if found["fresh"]["sha256"] != again["fresh"]["sha256"] or found["r2"]["composite"] != again["r2"]["composite"]:
         raise ValueError("the paper's own system was measured beside other networks")
-    for system in (AS_GUESSED.keys() | AS_CHOSEN.keys()) & again["r2"].keys():
+    for system in (SYSTEMS.keys() | {"paper_guessed"}) & again["r2"].keys():
         for old, new in ((found, again), (found["fresh"], again["fresh"])):
             old["r2"][system] = new["r2"][system]
         found["sizes"][system] = again["sizes"][system]
-    found |= {name: again[name] for name in ("paper_factors", "paper_chosen_factors") if name in again}
+    found |= {name: again[name] for name in ("paper_factors", "paper_guessed_factors") if name in again}
 
 
 def without_bump(count: int = 1000) -> float:

@@ -1,10 +1,9 @@
 """The paper's own system (section 4) for a committed run of a generator that was measured without it.
 
 ``python -m benchmarks.paper NAME …`` draws the run's samples again, which a generator reproduces up to rounding. It
-trains the paper's factor networks and convolutions on them. R² on the run's own test codes and fresh codes goes to
-``runs/NAME-paper/evaluation.json``, next to the figures of the run's other models. With ``--chosen`` it does so for the
-paper's system with the sizes that validation codes of Freaky Torus chose, which the paper leaves open.
-``benchmarks.bundled`` writes the page. The command takes an hour on a processor; an interrupted call can be continued.
+trains the paper's factor networks and convolutions on them, and its monolithic network of the same sizes. R² on the
+run's own test codes and fresh codes goes to ``runs/NAME-paper/evaluation.json``, next to the figures of the run's other
+models. ``benchmarks.bundled`` writes the page. An interrupted call can be continued.
 """
 
 import argparse
@@ -19,17 +18,11 @@ import torch
 from benchmarks.pages import ROOT, write_figures
 from shapespace.training.learning.composite import Composite
 from shapespace.training.learning.evaluation import HeldOutSamples, Model, r_squared, size_bytes
-from shapespace.training.learning.learner import PAPER
+from shapespace.training.learning.learner import PAPER, PAPER_PERCEPTRON
 from shapespace.training.learning.networks import FactorNetwork, predict
 from shapespace.training.runs.config import load
 from shapespace.training.runs.latent_coordinates import alone
-from shapespace.training.runs.network_settings import (
-    CombinerSettings,
-    ConvolutionSettings,
-    FitSettings,
-    LatentNetworkSettings,
-    Recipe,
-)
+from shapespace.training.runs.network_settings import LatentNetworkSettings, Recipe
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run
@@ -38,37 +31,9 @@ from shapespace.training.stages.stage import Run
 ROUNDING = 1e-6
 
 
-#: Perceptrons that validation codes of the bump chose (NOTES.md, The paper's own system). The loss has the norm of R².
-#: The last layer has principal axes of the training shapes as its basis, so that an epoch takes a tenth of the time.
-PERCEPTRON = LatentNetworkSettings(
-    hidden=[512, 512, 512, 512],
-    normalisation="none",
-    skip_degree=0,
-    energy=0.9999,
-    eta=1e-2,
-    fit=FitSettings(schedule="cosine", learning_rate=1e-3, max_epochs=200),
-)
-#: The paper's system with sizes chosen here. Its combiner learns the difference from the affine sum, which the paper
-#: does not say. NOTES.md compares.
-CHOSEN = Recipe(
-    factors=PERCEPTRON,
-    combiner=CombinerSettings(
-        correction=ConvolutionSettings(
-            layers=4,
-            width=48,
-            edge_channels=0,
-            dropout=0,
-            normalisation="after",
-            fit=FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=2, max_epochs=12),
-        ),
-        symmetries=False,
-        eta=1e-2,
-    ),
-)
 #: Composites, or networks of the whole code, by their names in ``evaluation.json``.
 Systems = Mapping[str, Recipe | LatentNetworkSettings]
-AS_GUESSED: Systems = {"paper": PAPER}
-AS_CHOSEN: Systems = {"paper_chosen": CHOSEN, "monolithic_chosen": PERCEPTRON}
+SYSTEMS: Systems = {"paper": PAPER, "monolithic_chosen": PAPER_PERCEPTRON}
 
 
 class OtherSamplesError(ValueError):
@@ -119,10 +84,8 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "results", help="folder of the runs")
-    parser.add_argument("--chosen", action="store_true", help="with the sizes chosen here, beside the earlier figures")
     parser.add_argument("names", nargs="+", help="folders of runs/")
     given = parser.parse_args()
-    systems = AS_CHOSEN if given.chosen else AS_GUESSED
     for name in given.names:
         record, file = ROOT / "runs" / name, ROOT / "runs" / f"{name}-paper" / "evaluation.json"
         evaluation = json.loads((file if file.exists() else record / "evaluation.json").read_text())
@@ -130,7 +93,7 @@ def main() -> None:
         measure(
             Run(given.out / name, *load(config, stored=config), given.out / "models"),
             evaluation,
-            systems,
+            SYSTEMS,
         )
         write_figures(file, evaluation)
 

@@ -1,7 +1,7 @@
 """docs/measurements/freaky-torus-paper.png and its neighbours: figures of the paper, with its system as trained here.
 
 ``python -m benchmarks.paper_pictures RUN`` draws shapes of the paper's models, the factors of the torus, and an
-interpolation. RUN is the folder that ``benchmarks.paper --chosen`` has trained.
+interpolation. RUN is the folder that ``benchmarks.paper`` has trained.
 """
 
 import argparse
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from benchmarks.pages import MEASUREMENTS
-from benchmarks.paper import CHOSEN, PERCEPTRON
 from benchmarks.pictures import CODES, SIZE, compared, save
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import nric
@@ -19,7 +18,7 @@ from shapespace.coordinates.reconstruction import Reconstructor
 from shapespace.mesh.rigid_motion import align
 from shapespace.training.learning.composite import Composite, affine_sum
 from shapespace.training.learning.evaluation import strip
-from shapespace.training.learning.learner import Learner
+from shapespace.training.learning.learner import PAPER_PERCEPTRON, Learner
 from shapespace.training.learning.networks import predict
 from shapespace.training.report.pictures import CLAY, Studio
 from shapespace.training.report.rendering import Camera
@@ -41,7 +40,7 @@ def models(learner: Learner, composite: Composite, eta: float, path: Path) -> No
     parts = [collection.shapes(alone(codes, index)).nric for index in collection.factors.values()]
     exact = align(collection.shapes(codes).vertices.astype(np.float64), reference.vertices)
     rest = nric(reference.vertices, reference.connectivity)
-    single = learner.joint_network("monolithic-paper", PERCEPTRON)
+    single = learner.joint_network("monolithic-paper", PAPER_PERCEPTRON)
     found = {
         "the paper's system": predict(composite, latents).numpy(),
         "its monolithic network": predict(single, latents).numpy(),
@@ -93,7 +92,7 @@ def main() -> None:
     stored = given.run / "config.toml"
     run = Run(given.run, *load(stored, stored=stored), given.run / "models")
     learner, eta = learner_of(run), run.config.export.eta_reconstruction
-    composite = learner.composite(CHOSEN)
+    composite = learner.paper()
     models(learner, composite, eta, MEASUREMENTS / "freaky-torus-paper.png")
     factors(learner.collection, MEASUREMENTS / "freaky-torus-factors.png")
     interpolation(learner.collection, composite, eta, MEASUREMENTS / "freaky-torus-interpolation.png")

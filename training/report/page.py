@@ -28,7 +28,7 @@ MODELS = {
     "monolithic": "The same recipe with one factor",
     "kernel": "Kernel ridge regression on the codes",
     "monolithic_paper": "The paper's monolithic network",
-    "paper": "The paper's composite network",
+    "paper": "The paper's composite network, sizes chosen here",
     "affine": "Affine sum of exact factors",
     "affine of learned factors": "Affine sum of learned factors",
     "grid": "Affine sum of multilinear grids",

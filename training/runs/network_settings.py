@@ -297,4 +297,4 @@ class NetworkSettings(Recipe):
     seeds: list[int] = Field([])
     """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
     paper: bool = False
-    """Whether to train the paper's own system too, for comparison: hours on a processor."""
+    """Whether to train the paper's own system too, for comparison. It about doubles the time of this stage."""

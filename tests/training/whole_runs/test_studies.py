@@ -78,8 +78,8 @@ def test_a_row_of_folds_counts_each_shape_once() -> None:
 def test_a_model_measured_later_meets_the_codes_of_the_others(copy: Run) -> None:
     """The main networks, in the place of the paper's that take hours, reach again what they have reached."""
     before = copy.directory.evaluation.read()
-    same = {"paper": "composite", "paper_chosen": "composite", "monolithic_chosen": "monolithic_paper"}
-    assert same.keys() == {*paper.AS_GUESSED, *paper.AS_CHOSEN}
+    same = {"paper": "composite", "monolithic_chosen": "monolithic_paper"}
+    assert same.keys() == paper.SYSTEMS.keys()
     settings = {"composite": copy.config.networks, "monolithic_paper": copy.config.monolithic_paper}
     after = deepcopy(before)
     paper.measure(copy, after, {system: settings[model] for system, model in same.items()})
