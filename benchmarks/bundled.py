@@ -2,8 +2,7 @@
 
 ``python -m benchmarks.bundled`` writes the page from ``runs/figure``, ``runs/freaky-torus`` and
 ``runs/freaky-torus-1000``. The figures of the paper's own system come from the folders next to these whose names end
-in ``-paper``. ``runs/figure-paper`` is a run of an earlier version of the figure, with ``networks.paper``;
-``benchmarks.paper`` measured the torus. The command trains nothing.
+in ``-paper``, where ``benchmarks.paper`` writes them. The command trains nothing.
 """
 
 import json
@@ -72,10 +71,9 @@ def page() -> str:
     """Return the text of the page."""
     names = {"figure": "figure", "torus": "freaky-torus", "alone": "freaky-torus-1000"}
     runs = {key: record(name) for key, name in names.items()}
-    for key in ("torus", "alone"):
-        if (again := ROOT / "runs" / f"{names[key]}-paper" / "evaluation.json").is_file():
+    for key, name in names.items():
+        if (again := ROOT / "runs" / f"{name}-paper" / "evaluation.json").is_file():
             add_paper(runs[key]["evaluation"], json.loads(again.read_text()))
-    earlier = record("figure-paper")
     exported = runs["figure"]["config"].export
     manifest = json.loads((ROOT / "models" / exported.name / str(exported.version) / "manifest.json").read_text())
     folds = [fold["unseen"] for fold in pages.read_figures(served.FIGURES / f"{exported.name}.json")]
@@ -86,7 +84,6 @@ def page() -> str:
         models=MODELS,
         bumpless=without_bump(),
         manifest=manifest,
-        earlier=earlier,
         served=[served.average(folds, model, ("mean",)) for model in (None, "components")],
         other_angles=max(r2["angles"] for name, r2 in torus["fresh"]["r2"].items() if name != "composite"),
         lowest=min(r2["composite"]["total"] for r2 in seeds),
