@@ -81,11 +81,13 @@ The ratio is to components with images. Coarse meshes differ from those in the f
 """
 PEOPLE_PAGE = """## An unseen pose, an unseen body
 
-{finding} {bodies} adults stand in {poses} poses each. Without every fifth pose, or without every fifth person, a run
-chooses map and number of modes by itself. The generator `people` makes the
-[bodies](../how-to/collections.md#bodies-without-data-of-your-own).
+{finding}
 
 {rows}
+
+{bodies} adults stand in {poses} poses each ([generator](../how-to/collections.md#bodies-without-data-of-your-own)
+`people`). A run without every fifth pose, or without every fifth person, chose map and number of modes by itself.
+Poses differ in more ways than {poses} poses can show, so no model comes near to an unseen one.
 
 """
 #: A ratio below this is a clear gain.
@@ -219,7 +221,7 @@ def people_section(found: dict[str, Any]) -> str:
             f"{shares[best]:.2f}, {SIMPLE[best]}",
         ])  # fmt: skip
     return PEOPLE_PAGE.format(
-        finding=f"The error is {' and '.join(ratios)}, as a share of the error of principal components.",
+        finding=f"As a share of the error of principal components, ours is {' and '.join(ratios)}.",
         bodies=found["bodies"],
         poses=found["poses"],
         rows=pages.table(("unseen", "error", "of components", "ratio", "best simple model's ratio"), cells),
