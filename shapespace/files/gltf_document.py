@@ -34,6 +34,8 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 #: Largest ``byteStride`` (3.6.2.4).
 _LARGEST_STRIDE = 252
+#: Largest rounding error of the last row of a matrix.
+_ROUNDED = 1e-5
 _DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
 
 
@@ -64,7 +66,8 @@ def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
         raise MeshError(f"it has GLB version {version}, but only version 2 can be read")
     if not 20 + size <= length <= len(data):
         raise ValueError(f"it should have {length} bytes, but has {len(data)}")
-    text, rest = data[20 : 20 + size], data[20 + size : length]
+    # Some programs write zeros behind the text.
+    text, rest = memoryview(bytes(data[20 : 20 + size]).rstrip(b"\0")), data[20 + size : length]
     if len(rest) < 8:
         return text, None
     size, kind = struct.unpack_from("<I4s", rest)
@@ -87,7 +90,9 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
         pieces += [text[place:start], b"data:%d" % len(uris)]
         uris.append(text[start:stop])
         place = stop
-    tree = json.loads(b"".join([*pieces, text[place:]]))
+    # Some programs write null for what is not there.
+    content = b"".join([*pieces, text[place:]])
+    tree = json.loads(content, object_hook=lambda entry: {k: v for k, v in entry.items() if v is not None})
     if not isinstance(tree, dict):
         raise ValueError("its JSON is not an object")
     return tree, uris
@@ -107,9 +112,8 @@ class GltfDocument:
 
     def __init__(self, tree: dict[str, Any]) -> None:
         self.tree = tree
-        version = clipped(tree.get("asset", {}).get("version", "2.0"))
-        if version.partition(".")[0] != "2":
-            raise MeshError(f"it has glTF version {version}, but only version 2 can be read")
+        if str(tree.get("asset", {}).get("version", "2.0")).partition(".")[0] != "2":
+            raise MeshError("it has another version of glTF, but only version 2 can be read")
         required = [name for name in tree.get("extensionsRequired", []) if name != _QUANTIZATION]
         unknown = [name for name in required if not name.startswith(_APPEARANCE)]
         if unknown:
@@ -132,7 +136,7 @@ class GltfDocument:
         for node in self.nodes:
             for child in node.get("children", []):
                 if child in children:
-                    raise MeshError(f"its node {clipped(child)} lies in two others")
+                    raise MeshError("one of its nodes lies in two others")
                 children.add(child)
         if not self._scenes:
             return [k for k in range(len(self.nodes)) if k not in children]
@@ -180,7 +184,7 @@ class PlacedMesh:
     def joint_place(self, number: int) -> FloatArray:
         """Return the matrix (4, 4) of a joint; raises ValueError if it is not in the scene."""
         if number not in self.places:
-            raise ValueError(f"its joint {clipped(number)} is not a node of the scene")
+            raise ValueError("a joint of its skin is not a node of the scene")
         place = self.places[number]
         return np.eye(4) if place is None else place
 
@@ -195,14 +199,17 @@ def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 def entry_at(entries: list[dict[str, Any]], index: object) -> dict[str, Any]:
     """Return the entry at an index; raises ValueError if it is not an index of an entry."""
-    if _natural(index) >= len(entries):
-        raise ValueError(f"it refers to entry {clipped(index)} of a list that has {len(entries)}, counted from 0")
-    return entries[_natural(index)]
+    number = _natural(index)
+    if number >= len(entries):
+        raise ValueError(f"it refers to entry {number} of a list that has {len(entries)}, counted from 0")
+    return entries[number]
 
 
 def _natural(value: object) -> int:
-    if type(value) is not int or value < 0:
-        raise ValueError(f"{clipped(value)} stands where a whole number should")
+    if isinstance(value, float) and value.is_integer():  # as some programs write 3
+        value = int(value)
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ValueError("something else stands where a whole number from 0 should")
     return value
 
 
@@ -219,8 +226,9 @@ def _matrix(node: dict[str, Any]) -> FloatArray | None:
         matrix[:3, 3] = _numbers(node["translation"], 3)
     if "matrix" in node:
         given = _numbers(node["matrix"], 16).reshape(4, 4).T
-        if (given[3] != [0, 0, 0, 1]).any():
+        if not np.allclose(given[3], [0, 0, 0, 1], atol=_ROUNDED):
             raise ValueError("the last row of a matrix is not 0, 0, 0, 1")
+        given[3] = [0, 0, 0, 1]
         matrix = given @ matrix
     return None if np.array_equal(matrix, np.eye(4)) else matrix
 
@@ -238,7 +246,7 @@ def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
 def _numbers(value: object, length: int) -> FloatArray:
     numbers = np.array(value, np.float64)
     if numbers.shape != (length,):
-        raise ValueError(f"{length} numbers are needed in a node, not {clipped(value)}")
+        raise ValueError(f"{length} numbers are needed in a node, not something else")
     return numbers
 
 
@@ -292,7 +300,7 @@ class Accessor:
         dtype, width = np.dtype(_DTYPES[component]), _WIDTHS[kind]
         size = width * dtype.itemsize
         view = entry_at(document.views, entry["bufferView"])
-        stride, inside = _natural(view.get("byteStride", size)), _natural(entry.get("byteOffset", 0))
+        stride, inside = _natural(view.get("byteStride") or size), _natural(entry.get("byteOffset", 0))
         if not count or not size <= stride <= _LARGEST_STRIDE:
             raise ValueError(f"its {name} has {count} elements, {stride} bytes apart")
         start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
 
 _HEAD = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
@@ -61,7 +61,7 @@ def read_pcd(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         columns_of = zip(axes, offsets, strict=True)
         found = np.stack([np.ndarray((points,), row[k], content, offset)[:, 0] for k, offset in columns_of], axis=1)
     else:
-        raise MeshError(f"its data are {clipped(kind.decode(errors='replace'))}, which can't be read: save it as ascii")
+        raise MeshError("its data are neither ascii, binary nor binary_compressed: save it as ascii")
     if len(found) != points:
         raise ValueError(f"it should have {points} points, but has {len(found)}")
     return found[~np.isnan(found).any(axis=1)].astype(np.float64), np.zeros((0, 3), np.int64)

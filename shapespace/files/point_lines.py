@@ -1,11 +1,10 @@
-"""Lines of a text with points: which are points, and how messages show them."""
+"""Lines of a text with points: which are points, and what messages say about the others."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from shapespace.files.limits import quoted
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Characters of a line.
@@ -71,10 +70,10 @@ def is_beside(line: str) -> bool:
 
 def fault(text: str, place: int, line: str, beside: tuple[int, str] | None = None) -> ValueError:
     """Error of a line that is no point, or is written otherwise than a line before."""
-    says = f"line {line_number(text, place)} is {quoted(line)}"
+    says = f"line {line_number(text, place)}"
     if beside is not None and (is_point(line, False) or is_point(line, True)):
         return ValueError(
-            f"{says}, and line {line_number(text, beside[0])} is {quoted(beside[1])}: write all lines in the same way, "
+            f"{says} is written otherwise than line {line_number(text, beside[0])}: write all lines in the same way, "
             "with decimal points"
         )
-    return ValueError(f"{says}, which does not begin with three numbers: write x, y and z there, with decimal points")
+    return ValueError(f"{says} does not begin with three numbers: write x, y and z there, with decimal points")
