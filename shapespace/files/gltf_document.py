@@ -25,8 +25,10 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most levels of nodes. Programs that model write far fewer.
 _MOST_LEVELS = 100
-#: Prefixes of extensions that change no triangle, so that a file may require them.
-_APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
+#: Extensions that change no triangle, so that a file may require them.
+_APPEARANCE = re.compile(
+    "VRM|MSFT_texture|(KHR|EXT)_(materials|texture|lights|xmp|audio|animation_pointer|mesh_(features|manifold)|struct)"
+)
 #: Extension that allows positions as integers. It is implemented here.
 _QUANTIZATION = "KHR_mesh_quantization"
 #: NumPy types of component types, and components of element types (3.6.2.2).
@@ -34,8 +36,6 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 #: Largest ``byteStride`` (3.6.2.4).
 _LARGEST_STRIDE = 252
-#: Largest rounding error of the last row of a matrix.
-_ROUNDED = 1e-5
 _DATA_URI = re.compile(rb'"(data:[^"\\]*+)"')
 
 
@@ -66,8 +66,7 @@ def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
         raise MeshError(f"it has GLB version {version}, but only version 2 can be read")
     if not 20 + size <= length <= len(data):
         raise ValueError(f"it should have {length} bytes, but has {len(data)}")
-    # Some programs write zeros behind the text.
-    text, rest = memoryview(bytes(data[20 : 20 + size]).rstrip(b"\0")), data[20 + size : length]
+    text, rest = memoryview(bytes(data[20 : 20 + size]).rstrip(b"\0")), data[20 + size : length]  # zeros may follow
     if len(rest) < 8:
         return text, None
     size, kind = struct.unpack_from("<I4s", rest)
@@ -90,12 +89,17 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
         pieces += [text[place:start], b"data:%d" % len(uris)]
         uris.append(text[start:stop])
         place = stop
-    # Some programs write null for what is not there.
     content = b"".join([*pieces, text[place:]])
-    tree = json.loads(content, object_hook=lambda entry: {k: v for k, v in entry.items() if v is not None})
+    # Some programs write null for what is not there.
+    tree = json.loads(content, object_hook=lambda o: {k: o[k] for k in o if o[k] is not None}, parse_float=_number)
     if not isinstance(tree, dict):
         raise ValueError("its JSON is not an object")
     return tree, uris
+
+
+def _number(text: str) -> float:
+    """Return a number; some programs write 3.0 for 3."""
+    return int(value) if (value := float(text)).is_integer() else value
 
 
 class GltfDocument:
@@ -115,7 +119,7 @@ class GltfDocument:
         if str(tree.get("asset", {}).get("version", "2.0")).partition(".")[0] != "2":
             raise MeshError("it has another version of glTF, but only version 2 can be read")
         required = [name for name in tree.get("extensionsRequired", []) if name != _QUANTIZATION]
-        unknown = [name for name in required if not name.startswith(_APPEARANCE)]
+        unknown = [name for name in required if not _APPEARANCE.match(name)]
         if unknown:
             raise MeshError(
                 f"it requires {clipped(', '.join(unknown))}, which can't be read: export it without this extension"
@@ -206,8 +210,6 @@ def entry_at(entries: list[dict[str, Any]], index: object) -> dict[str, Any]:
 
 
 def _natural(value: object) -> int:
-    if isinstance(value, float) and value.is_integer():  # as some programs write 3
-        value = int(value)
     if type(value) is not int or not 0 <= value < 2**63:
         raise ValueError("something else stands where a whole number from 0 should")
     return value
@@ -226,9 +228,8 @@ def _matrix(node: dict[str, Any]) -> FloatArray | None:
         matrix[:3, 3] = _numbers(node["translation"], 3)
     if "matrix" in node:
         given = _numbers(node["matrix"], 16).reshape(4, 4).T
-        if not np.allclose(given[3], [0, 0, 0, 1], atol=_ROUNDED):
+        if not np.allclose(given[3], [0, 0, 0, 1], atol=1e-5):
             raise ValueError("the last row of a matrix is not 0, 0, 0, 1")
-        given[3] = [0, 0, 0, 1]
         matrix = given @ matrix
     return None if np.array_equal(matrix, np.eye(4)) else matrix
 

@@ -342,6 +342,8 @@ def _targets(
         weight = float(weights[k]) if k < len(weights) else 0.0
         if "POSITION" not in target or not (weight or every_target):
             continue
+        if not entry_at(document.accessors, target["POSITION"]).keys() & {"bufferView", "sparse"}:
+            continue  # zeros, as Blender leaves them out
         moves = Accessor.of(document, target["POSITION"], "VEC3", _POSITIONS)
         if moves.count != vertices:
             raise ValueError(f"a morph target has {moves.count} of {vertices} vertices")
