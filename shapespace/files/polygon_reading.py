@@ -89,6 +89,10 @@ class Lines:
             return line
         raise EOFError(ENDS_EARLY)
 
+    def behind(self, line: bytes) -> bytes:
+        """Return the text behind the line that was read last."""
+        return bytes(self._data[self._place + len(line) :])
+
     def skip(self, count: int) -> None:
         """Skip ``count`` lines; raises EOFError if there are fewer."""
         if sum(1 for _ in islice(self._matches, count)) < count:
@@ -268,6 +272,7 @@ _STL_HEADER, _STL_COUNT = 84, 80
 #: Numbers of triangles in files whose program did not fill the number in, when it knew it.
 _UNCOUNTED = (0, 2**32 - 1)
 _STL_END = re.compile(rb"end\s*(?:loop|facet)", re.IGNORECASE)
+_STL_CLOSED = re.compile(rb"end\s*(facet|solid)", re.IGNORECASE)
 
 
 def read_stl(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
@@ -292,9 +297,15 @@ def _is_ascii_stl(data: memoryview) -> bool:
     return start.lstrip(_BYTE_ORDER_MARK + b" \t\r\n").startswith(b"solid") and b"\0" not in start
 
 
+def _is_whole_stl(last: bytes, behind: bytes) -> bool:
+    """Whether ASCII STL ends behind a solid, or behind a facet with no more than some of ``endsolid``."""
+    end = _STL_CLOSED.match(last)
+    return bool(end) and (end[1].lower() == b"solid" or b"endsolid".startswith(behind.strip().lower()))
+
+
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
     """Return the corners (3F, 3) of all solids, one after the other. A missing end of the last solid is accepted."""
-    coordinates, whole_facets = array("d"), 0
+    coordinates, whole_facets, part = array("d"), 0, b""
     with Lines(data, "a corner is vertex x y z, with decimal points, and a facet has three", _STL_PART) as parts:
         for part in parts:
             if part[:6].lower() == b"vertex":
@@ -306,6 +317,6 @@ def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
                 whole_facets = len(coordinates)
     if not whole_facets:
         raise ValueError("damaged, or another kind of file")
-    if len(coordinates) != whole_facets:
+    if len(coordinates) != whole_facets or not _is_whole_stl(part, parts.behind(part)):
         raise EOFError("it ends in the middle of a facet")
     return np.array(coordinates, np.float64).reshape(-1, 3)

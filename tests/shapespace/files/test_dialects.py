@@ -230,6 +230,7 @@ def test_polygons_of_several_sizes_are_cut_into_fans() -> None:
             "line 8 can't be read: .* a facet has three",
         ),
         (solid("a", FACES)[:-35].encode(), "stl", "in the middle of a facet"),
+        (solid("a", FACES)[:-11].encode() + b"facet norm", "stl", "in the middle of a facet"),
         (OBJ.replace("f 1", "f 0").encode(), "obj", "line 6 can't be read: .* whole numbers from 1"),
         (OBJ.replace("1.25", "-1.#IND00").encode(), "obj", "line 5 can't be read"),
         (cells("ascii")[:-9], "ply", "ends before"),
