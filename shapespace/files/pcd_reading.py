@@ -84,14 +84,15 @@ def _decompressed(data: memoryview, size: int) -> bytearray:
             place += 1
         start = len(out) - ((control & 31) << 8) - data[place] - 1
         place += 1
-        if start < 0:
-            raise ValueError("its compressed data are damaged")
-        length += 2
-        if start + length <= len(out):
-            out += out[start : start + length]
-        else:
-            pattern = bytes(out[start:])
-            out += (pattern * (length // len(pattern) + 1))[:length]
+        repeat(out, start, length + 2)
     if len(out) != size:
         raise ValueError(f"its compressed data make {len(out)} of {size} bytes")
     return out
+
+
+def repeat(out: bytearray, start: int, length: int) -> None:
+    """Append bytes that begin at ``start``, over and over; raises ValueError if there are none."""
+    pattern = bytes(out[start : start + length]) if start >= 0 else b""
+    if not pattern:
+        raise ValueError("its compressed data are damaged")
+    out += (pattern * (length // len(pattern) + 1))[:length]

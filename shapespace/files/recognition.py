@@ -27,6 +27,7 @@ _MAGIC = {
     "off": rb"\s*(?:#[^\n]*\n\s*)*(?i:(?:ST)?[CN]{0,2}OFF)[\s\d]",
     "pcd": rb"#\s*\.PCD\b|VERSION\s+[\d.]+\s+FIELDS\s",
     "vtk": rb"#\s*vtk DataFile",
+    "vtu": rb"\s*(?:<\?xml[^>]*>\s*)?<VTKFile\b[^>]*[\"']UnstructuredGrid[\"']",
     "vtp": rb"\s*(?:<\?xml[^>]*>\s*)?<VTKFile\b",
 }
 #: The start of files that are no meshes, or that are not read.
