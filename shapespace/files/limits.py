@@ -58,7 +58,7 @@ def reason(error: Exception) -> str:
     """Return the message of an error on one line, shortened, unless it repeats what stands in the file."""
     line = clipped(error, 300)
     unfit = (
-        isinstance(error, LookupError | TypeError | AttributeError | struct.error)
+        isinstance(error, LookupError | TypeError | AttributeError | RecursionError | struct.error)
         or not line.isprintable()
         or re.search(r"\\x[0-9a-f]|\\0|\ufffd|codec can't|invalid literal|could not convert", line)
     )

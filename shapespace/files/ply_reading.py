@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -118,9 +118,10 @@ def _read(elements: list[PlyElement], table: TextTable | BinaryTable, limits: Li
             limits.check(0, element.rows)
             faces = table.polygons(element)
         elif element.name == "tristrips" and element.rows:
-            strips = np.concatenate(
-                [strip_triangles(corners) for (corners,) in table.lists(element, [element.corners])]
+            corners = chain.from_iterable(
+                (-1, *map(int, strip)) for (strip,) in table.lists(element, [element.corners])
             )
+            strips = strip_triangles(np.fromiter(corners, np.int64))
             limits.check(0, len(strips))
         else:
             table.skip(element)
@@ -129,17 +130,17 @@ def _read(elements: list[PlyElement], table: TextTable | BinaryTable, limits: Li
     return vertices, faces if len(faces) else strips
 
 
-def strip_triangles(corners: Iterable[Any]) -> IntArray:
-    """Return the triangles (F, 3) of strips, which −1 separates; triangles without area join strips."""
-    found = [np.zeros((0, 3), np.int64)]
-    listed = np.array([*map(int, corners)], np.int64)
-    for strip in np.split(listed, np.flatnonzero(listed == -1)):
-        strip = strip[strip != -1]
-        if len(strip) >= 3:
-            faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
-            faces[1::2] = faces[1::2, [0, 2, 1]]
-            found.append(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
-    return np.concatenate(found)
+def strip_triangles(corners: IntArray) -> IntArray:
+    """Return the triangles (F, 3) of strips (n,), which −1 separates; triangles without area join strips."""
+    windows = np.stack([corners[k : max(len(corners) - 2 + k, 0)] for k in range(3)], axis=1)
+    places = np.arange(len(windows))
+    # Every second triangle of a strip is turned over.
+    begins = np.maximum.accumulate(np.where(windows[:, 0] == -1, places + 1, 0))
+    odd = (places - begins) % 2 == 1
+    windows[odd] = windows[odd][:, [0, 2, 1]]
+    kept = (windows != -1).all(axis=1) & (windows != np.roll(windows, 1, axis=1)).all(axis=1)
+    found: IntArray = windows[kept]
+    return found
 
 
 def open_table(data: memoryview, limits: Limits) -> tuple[list[PlyElement], TextTable | BinaryTable]:
@@ -293,8 +294,7 @@ class BinaryTable:
         if not element.lists:
             self._place += self._equal_rows(element).nbytes
             return
-        for _ in range(element.rows):
-            self._place = self._row(element)[1]
+        self._spans(element, 0)
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
         """Return the properties ``which`` of an element, which are no lists, (rows, k)."""

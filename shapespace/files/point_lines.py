@@ -9,7 +9,8 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 #: Characters of a line.
 _LONGEST_LINE = 2**16
-_LINE = re.compile(r"[^\s][^\r\n]*")
+#: A line, or one with separators alone, as spreadsheets write for rows without values.
+_LINE = re.compile(r"[,;|][ \t,;|]*+(?=[\r\n]|\Z)|([^\s][^\r\n]*)")
 REMARK = re.compile(r"#|//|%|!")
 WHOLE = re.compile(r"[+-]?\d+")
 POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)", re.IGNORECASE)
@@ -26,6 +27,8 @@ _LABEL = re.compile(r'^(?=[^,;\t]*[^\W\d])(?:[^,;\t"]*[,;\t]|"[^"]*"[\s,;]|\S+\s
 def lines(text: str) -> Iterator[tuple[int, str]]:
     """Lines that are not blank, without blanks at their ends, each with the place in the text where it starts."""
     for match in _LINE.finditer(text):
+        if match[1] is None:
+            continue
         if match.end() - match.start() > _LONGEST_LINE:
             raise MeshError(f"line {line_number(text, match.start())} has more than {_LONGEST_LINE} characters")
         yield match.start(), match[0].rstrip()

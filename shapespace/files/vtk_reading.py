@@ -31,9 +31,8 @@ _ANY_SECTION = re.compile(rb"(?<=\n)([A-Za-z_]{4,})[ \t]+\d+(?=[ \t\r\n])")
 #: Keywords that may begin a line with a number in a file of polygons.
 _KNOWN = ("POINTS", "VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS", "CELL_TYPES")
 _KNOWN += ("FIELD", "METADATA", "INFORMATION", "DATA")
-_OFFSETS, _CONNECTIVITY = (
-    re.compile(rb"\s*" + name + rb"[ \t]+(\w+)[^\n]*\n") for name in (b"OFFSETS", b"CONNECTIVITY")
-)
+_OFFSETS = re.compile(rb"\s*+OFFSETS[ \t]+(\w+)[^\n]*\n")
+_CONNECTIVITY = re.compile(rb"CONNECTIVITY[ \t]+(\w+)[^\n]*\n")
 #: Types of numbers. VTK writes its own indices, vtkIdType, with four bytes.
 _TYPES = {
     "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4",

@@ -24,9 +24,10 @@ from shapespace.files.vtk_cells import VtkCells, other_kind, require_vertices, s
 from shapespace.files.vtk_reading import DAMAGED, numbers
 from shapespace.mesh.triangle_mesh import MeshError
 
-_TAG = re.compile(rb"<!--.*?-->|<(/?)([A-Za-z]\w*)((?:[^<>\"']|\"[^\"]*\"|'[^']*')*+)>", re.DOTALL)
-_ATTRIBUTE = re.compile(rb"([\w:]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
-_APPENDED = re.compile(rb"<AppendedData\b([^>]*)>\s*_")
+_QUOTED = rb"\"[^\"]{0,1000}\"|'[^']{0,1000}'"
+_TAG = re.compile(rb"<!--.*?(?:-->|\Z)|<(/?)([A-Za-z]\w{0,30})((?:[^<>\"']++|" + _QUOTED + rb"){0,100}+)>", re.DOTALL)
+_ATTRIBUTE = re.compile(rb"(?<![\w:])([\w:]++)\s*+=\s*+(?:\"([^\"]*)\"|'([^']*)')")
+_APPENDED = re.compile(rb"<AppendedData\b([^<>]{0,200})>\s*+_")
 _TYPES = {f"{name}{8 * size}": f"{kind}{size}" for name, kind in (("Int", "i"), ("UInt", "u")) for size in (1, 2, 4, 8)}
 _TYPES |= {"Float32": "f4", "Float64": "f8"}
 #: Elements with the arrays of a piece that count, and its number of cells in each.

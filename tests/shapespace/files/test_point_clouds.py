@@ -72,6 +72,8 @@ READ = {
     "typographic minus signs": rows().replace("-", "\u2212"),
     "a NUL at the end": rows() + "\0",
     "the end-of-file character of DOS": rows() + "\x1a",
+    "rows without values": "x,y,z\n" + rows(",") + ",,\n, , ,\n",
+    "rows without values, with decimal commas": "x;y;z;\n" + rows(";", ",", after=";") + ";;;\n",
     "points that are NaN": "nan nan nan\n" + rows() + "1 nan 2\n",
     "a header in the encoding of Windows": ("Länge;x;y;z\n" + rows(";", ",", before="0,5;")).encode("cp1252"),
     "a header of 3D Slicer": "# columns = id,x,y,z,ow,label\n" + rows(",", before="node_{k},", after=",0,F-{k}"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io
+import lzma
 import zipfile
 from pathlib import Path
 
@@ -80,6 +82,20 @@ FOREIGN = {
     "a web page": b"\n<!DOCTYPE html><html>",
     "a USDZ file": archive("shape.usdc"),
     "a 3MF": archive("[Content_Types].xml", "3D/3dmodel.model"),
+    "a 3MF or an office": archive("3D/3dmodel.model", "[Content_Types].xml"),
+    "packed by bzip2": bz2.compress(b"v 1 2 3\n"),
+    "packed by xz": lzma.compress(b"v 1 2 3\n"),
+    "packed by Zstandard": b"\x28\xb5\x2f\xfd\x24\x08",
+    "a RAR archive": b"Rar!\x1a\7\0",
+    "one NumPy array": b"\x93NUMPY\1\0",
+    "a FreeSurfer surface: save": b"#!ascii version of lh.white\n3 1\n0 0 0 0\n1 0 0 0\n0 1 0 0\n0 1 2 0\n",
+    "a VRML file": b"#VRML V2.0 utf8\nShape {\n1 2 3,\n",
+    "an X3D file": b'<?xml version="1.0"?>\n<X3D profile="Interchange">',
+    "a Gmsh mesh": b"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n",
+    "a Medit mesh": b"MeshVersionFormatted 2\nDimension 3\nVertices\n1\n0 0 0 1\n",
+    "a DXF drawing": b"999\nmade by hand\n  0\r\nSECTION\r\n",
+    "a STEP file": b"ISO-10303-21;\nHEADER;\n",
+    "a BVH motion": b"HIERARCHY\nROOT Hips\nMOTION\n0 0 0 1 2 3\n",
     "a ZIP archive: unpack it first": archive("shape.obj"),
     "a FreeSurfer surface": b"\xff\xff\xfecreated by me",
     "a GIFTI surface": b'<?xml version="1.0"?>\n<!DOCTYPE GIFTI SYSTEM "gifti.dtd">\n<GIFTI Version="1.0">',
