@@ -36,7 +36,8 @@ _REMARK = re.compile(rb"#(?!IND|INF|[QS]NAN)")
 #: An exponent of Fortran, and decimals of a whole number.
 _FORTRAN, _POINT_ZERO = re.compile(rb"(?<=[\d.])[dD](?=[+-]?\d)"), re.compile(rb"(?<=\d)\.0*\Z")
 #: The lines that OBJ should have.
-OBJ_WANTED = "a vertex is v x y z with decimal points, and a face is f a b c with whole numbers from 1"
+OBJ_VERTEX = "a vertex is v x y z, with decimal points"
+OBJ_FACE = "a face is f a b c, with whole numbers from 1"
 
 
 def _lines_with(start: bytes) -> re.Pattern[bytes]:
@@ -147,9 +148,10 @@ def read_obj(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         return read_mni(text, limits)
     if b"\0" in start.rstrip(b"\0"):
         raise ValueError("it is not text")
-    with Lines(joined_lines(text), OBJ_WANTED, _OBJ_LINE) as lines:
+    with Lines(joined_lines(text), OBJ_VERTEX, _OBJ_LINE) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
+            lines.wanted = OBJ_VERTEX if keyword in b"vV" else OBJ_FACE
             if keyword in b"vV":
                 coordinates.extend(_point(values[0]))
                 if len(coordinates) > most:

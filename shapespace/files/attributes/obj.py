@@ -16,14 +16,14 @@ from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import clipped, label, read_plain
-from shapespace.files.polygon_reading import OBJ_WANTED, Lines, joined_lines, whole
+from shapespace.files.polygon_reading import OBJ_FACE, OBJ_VERTEX, Lines, joined_lines, whole
 from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Normals that agree to this number of decimals are equal.
 _NORMAL_DECIMALS = 3
 #: The lines that OBJ and MTL should have.
-_WANTED = f"{OBJ_WANTED}, where a corner may be a/b/c"
+_WANTED = f"{OBJ_VERTEX}; {OBJ_FACE}, where a corner may be a/b/c"
 _MTL_WANTED = "Kd has three numbers, and d, Tr, Pm and Pr have one, with decimal points"
 #: Options of a map in MTL, with their largest number of values.
 _MAP_OPTIONS = {b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-texres": 1}

@@ -160,7 +160,7 @@ LINE = b"v 0 0 0\n"
 REFUSED: dict[str, tuple[str, bytes, str]] = {
     "OBJ: no number": ("obj", LINE + b"\nv 1 x 2\n", "line 3 can't be read: a vertex is v x y z"),
     "OBJ: two numbers": ("obj", LINE + b"v 1 2\n", "line 2 can't be read: a vertex"),
-    "OBJ: a number of a million digits": ("obj", LINE + b"f 1 1 " + b"9" * 10**6, "line 2 can't be read: a vertex"),
+    "OBJ: a number of a million digits": ("obj", LINE + b"f 1 1 " + b"9" * 10**6, "line 2 can't be read: a face"),
     "OFF: of four dimensions": ("off", b"4OFF\n1 0 0\n0 0 0 0\n", "line 1 can't be read: the keyword OFF"),
     "OFF: rows are missing": ("off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n", "it ends before"),
     "OFF: corners are missing": ("off", b"OFF\n1 1 0\n0 0 0\n3 0 0\n", "it ends before the data that it announces"),
