@@ -302,7 +302,7 @@ def _is_ascii_stl(data: memoryview) -> bool:
 def _is_whole_stl(last: bytes, behind: bytes) -> bool:
     """Whether ASCII STL ends behind a solid, or behind a facet with no more than some of ``endsolid``."""
     end = _STL_CLOSED.match(last)
-    return bool(end) and (end[1].lower() == b"solid" or b"endsolid".startswith(behind.strip().lower()))
+    return end is not None and (end[1].lower() == b"solid" or b"endsolid".startswith(behind.strip().lower()))
 
 
 def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:

@@ -6,6 +6,7 @@ import re
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
@@ -75,7 +76,7 @@ class VtkCells(NamedTuple):
         if self.offsets[-1] > len(self.corners):
             raise ValueError(ENDS_EARLY)
 
-    def _chosen(self, cells: IntArray) -> VtkCells:
+    def _chosen(self, cells: NDArray[np.bool_]) -> VtkCells:
         """Return some cells, given by a mask (n,)."""
         sizes = np.diff(self.offsets)
         corners = self.corners[: self.offsets[-1]][np.repeat(cells, sizes)]

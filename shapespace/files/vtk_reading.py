@@ -29,8 +29,8 @@ _SECTION = re.compile(
 )
 _ANY_SECTION = re.compile(rb"(?<=\n)([A-Za-z_]{4,})[ \t]+\d+(?=[ \t\r\n])")
 #: Keywords that may begin a line with a number in a file of polygons.
-_KNOWN = ("POINTS", "VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS", "CELL_TYPES")
-_KNOWN += ("FIELD", "METADATA", "INFORMATION", "DATA")
+_KNOWN = {"POINTS", "VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS", "CELLS", "CELL_TYPES"}
+_KNOWN |= {"FIELD", "METADATA", "INFORMATION", "DATA"}
 _OFFSETS = re.compile(rb"\s*+OFFSETS[ \t]+(\w+)[^\n]*\n")
 _CONNECTIVITY = re.compile(rb"CONNECTIVITY[ \t]+(\w+)[^\n]*\n")
 #: Types of numbers. VTK writes its own indices, vtkIdType, with four bytes.

@@ -66,7 +66,7 @@ class _XmlFile:
     def __init__(self, data: memoryview) -> None:
         appended = _APPENDED.search(data)
         self._appended = data[appended.end() :] if appended else None
-        self._raw = bool(appended) and _attributes(appended[1]).get("encoding") == "raw"
+        self._raw = appended is not None and _attributes(appended[1]).get("encoding") == "raw"
         self.pieces: list[_Piece] = []
         self._head: dict[str, str] = {}
         section = ""
