@@ -193,9 +193,9 @@ def whole(values: Iterable[bytes]) -> list[int]:
 def read_off(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
     """Return vertices (V, 3) and faces (F, 3) of an OFF file; colours, normals and texture coordinates are ignored.
 
-    The keyword can be OFF with any of ST, C and N in front. Counts and rows may go on in the next line, or share one.
-    Some files lack the colours or normals that the keyword says. So the first of three layouts that explains the whole
-    file counts.
+    The keyword can be OFF with any of ST, C and N in front, and the file text or binary. In a text, counts and rows may
+    go on in the next line, or share one. Some files lack the colours or normals that the keyword says. So the first of
+    three layouts that explains the whole file counts.
     """
     try:
         return _read_off(data, limits, OffLayout.ROWS)
@@ -224,7 +224,7 @@ def _read_off(data: memoryview, limits: Limits, layout: OffLayout) -> tuple[Floa
             raise ValueError("another kind of file")
         prefix, rest = (found[1] or b"").upper(), (found[2] or found[4] or b"").split()
         if rest and rest[0].upper() == b"BINARY":
-            raise MeshError("it is binary OFF, which can't be read: save it as text")
+            return _binary_off(data, prefix, limits)
         width = 3 if layout is OffLayout.PLAIN_ROWS else 3 + 2 * (b"ST" in prefix) + 3 * sum(map(prefix.count, b"CN"))
         rows = layout is not OffLayout.NUMBERS
         counts = _row(lines, 1, rest)
@@ -251,6 +251,32 @@ def _read_off(data: memoryview, limits: Limits, layout: OffLayout) -> tuple[Floa
         if not rows and (left or next(iter(lines), None)):
             raise ValueError("more numbers than it says")
     return np.array(coordinates, np.float64).reshape(-1, 3), triangles.faces
+
+
+def _binary_off(data: memoryview, prefix: bytes, limits: Limits) -> tuple[FloatArray, IntArray]:
+    """Return the same of a binary file: after the first line, big-endian integers and floats of four bytes."""
+    body = data[bytes(data[:1000]).index(b"\n") + 1 :]
+    body = body[: len(body) // 4 * 4]
+    if len(body) < 12:
+        raise EOFError(ENDS_EARLY)
+    vertex_count, face_count, _ = np.frombuffer(body, ">i4", 3).tolist()
+    limits.check(vertex_count, face_count)
+    width = 3 + 3 * (b"N" in prefix) + 4 * (b"C" in prefix) + 2 * (b"ST" in prefix)
+    if min(vertex_count, face_count) < 0 or len(body) < 12 + 4 * (width * vertex_count + 2 * face_count):
+        raise EOFError(ENDS_EARLY)
+    vertices = np.frombuffer(body, ">f4", width * vertex_count, 12).reshape(-1, width)[:, :3]
+    values, triangles = np.frombuffer(body, ">i4", -1, 12 + 4 * width * vertex_count), TriangleFans(limits)
+    place = 0
+    for _ in range(face_count):
+        # The number of corners, the corners, the number of colours, and the colours.
+        end = place + 1 + (int(values[place]) if place < len(values) else 0)
+        if not place < end < len(values) or values[end] < 0:
+            raise EOFError(ENDS_EARLY)
+        triangles.add(values[place + 1 : end].tolist())
+        place = end + 1 + int(values[end])
+    if place > len(values):
+        raise EOFError(ENDS_EARLY)
+    return vertices.astype(np.float64), triangles.faces
 
 
 def _row(lines: Lines, count: int, row: list[bytes] | None = None) -> list[bytes]:

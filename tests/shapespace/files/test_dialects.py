@@ -38,6 +38,14 @@ def binary_stl(after: bytes = b"") -> bytes:
     return b"made by a scanner".ljust(80) + struct.pack("<I", len(FACES)) + rows + after
 
 
+def binary_off(keyword: str, beside: int) -> bytes:
+    """Return the file with some more numbers behind each vertex, and three colours behind every second face."""
+    rows = np.hstack([VERTICES, np.ones((len(VERTICES), beside))]).astype(">f4").tobytes()
+    colours = (struct.pack(">i", 0), struct.pack(">i3f", 3, 1, 0, 0))
+    faces = b"".join(struct.pack(">4i", 3, *face) + colours[k % 2] for k, face in enumerate(FACES.tolist()))
+    return f"{keyword} BINARY\n".encode() + struct.pack(">3i", len(VERTICES), len(FACES), 0) + rows + faces
+
+
 def ply(property_name: str) -> bytes:
     head = (
         f"ply\nformat binary_little_endian 1.0\nelement vertex {len(VERTICES)}\nproperty float x\nproperty float y\n"
@@ -118,6 +126,8 @@ MESHES: dict[str, tuple[str, str | bytes]] = {
     "NOFF with normals on their own lines": ("off", off(f"NOFF\n{COUNTS}", "\n0 0 1")),
     "COFF with colours on their own lines": ("off", off(f"COFF\n{COUNTS}", "\n255 0 0 255")),
     "COFF without colours": ("off", off(f"COFF\n{COUNTS}")),
+    "binary OFF": ("off", binary_off("OFF", 0)),
+    "binary STCNOFF": ("off", binary_off("STCNOFF", 9)),
     "OFF without its keyword": ("off", off(COUNTS)),
     "OFF with edges and points": ("off", off("OFF\n5 8 0") + "2 0 1\n1 3\n"),
     "PLY with one number a line": ("ply", cells("ascii", "\n")),
@@ -155,6 +165,7 @@ SOUPS: dict[str, tuple[str, str | bytes]] = {
 }
 #: Of these trimesh reads something else: it knows fewer keywords, or stops at the byte-order mark.
 ALONE = {
+    "binary OFF", "binary STCNOFF",
     "OBJ with capital keywords", "OBJ with a byte-order mark", "OBJ in UTF-16", "OFF with counts over two lines",
     "OFF with its counts glued to the keyword", "OFF in small letters", "OFF with remarks", "NOFF", "CNOFF", "NCOFF",
     "STOFF", "OFF with rows over several lines", "PLY with a space in the name of a property", "COFF",
@@ -221,7 +232,9 @@ def test_polygons_of_several_sizes_are_cut_into_fans() -> None:
 @pytest.mark.parametrize(
     ("content", "format", "says"),
     [
-        (b"OFF BINARY\n\0\0\0\5", "off", "binary OFF"),
+        (b"OFF BINARY\n\0\0\0\5", "off", "ends before"),
+        (binary_off("OFF", 0)[:-4], "off", "ends before"),
+        (binary_off("OFF", 0).replace(b"\0\0\0\6", b"\0\0\0\7", 1), "off", "ends before"),
         (b"4OFF\n1 1 0\n", "off", "line 1 can't be read"),
         (binary_stl()[:-1], "stl", "damaged"),
         (
