@@ -107,7 +107,7 @@ class _XmlFile:
             if size < 0 or (np.diff(ends) < 0).any():
                 raise ValueError(ENDS_EARLY)
             # A triangle has three corners, and larger polygons have fewer for each triangle.
-            limits.check(0, size // 3 if section == "Polys" else 0)
+            limits.check(0, {"Polys": size // 3, "Strips": size - 2 * count}.get(section, 0))
             corners = self._array(piece, section, "connectivity", size).astype(np.int64)
             found = VtkCells(np.append(0, ends), corners, strips=section == "Strips")
             types = self._array(piece, section, "types", count) if section == "Cells" else None
