@@ -79,6 +79,7 @@ DIALECTS = {
     "npz": "test_formats test_archives",
     "vtk": "test_vtk",
     "vtp": "test_vtk",
+    "vtu": "test_vtk",
     "xyz": "test_point_clouds",
     "pts": "test_point_clouds",
     "csv": "test_point_clouds",

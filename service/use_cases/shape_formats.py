@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.colouring import Colouring
 from shapespace.files.formats import MESH_FORMATS, OBJ_ZIP, USD_FORMATS, VTK_FORMATS, MeshFormat
 from shapespace.files.usd import usd_installed
-from shapespace.files.vtk_reading import vtk_installed
+from shapespace.files.vtk_writing import vtk_installed
 from shapespace.mesh.attributes import MeshAttributes, Topology
 from shapespace.model.exact_shapes import ExactShape
 from shapespace.model.shape import Diagnostics, Quality

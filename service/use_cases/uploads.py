@@ -21,9 +21,7 @@ from shapespace.files.archives import Place, natural_order, seekable
 from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.recognition import Assumed, FormatError, decide
-from shapespace.files.vtk_reading import VTK_FORMATS, vtk_loaded
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.limits.sandbox_child import raise_memory_limit
 from shapespace.service.limits.sandbox_errors import FailedError
 from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
 from shapespace.service.use_cases.forms import (
@@ -54,8 +52,6 @@ MEDIA_TYPES = {
 _GIVEN = "?format="
 #: Most vertices, and most faces, of all meshes of an archive.
 TOGETHER = Limits(2**21, 2**21)
-#: Bytes that loading the package ``vtk`` maps, and some more. The first VTK file of a process loads it.
-_VTK_MEMORY = 192 * 2**20
 
 
 class UnusableMeshError(UploadError):
@@ -161,8 +157,6 @@ def _looks_otherwise(data: memoryview, assumed: Assumed) -> str:
 def _read(
     data: memoryview, format: str, limits: Limits, *, points: bool, name: str = "", beside: Place | None = None
 ) -> UploadedMesh:
-    if format in VTK_FORMATS and not vtk_loaded():
-        raise_memory_limit(_VTK_MEMORY)
     if format == "json":
         return UploadedMesh(*_checked(*_read_json(data, limits)), name)
     return UploadedMesh(*_checked(*read_arrays(data, format, limits, points=points, beside=beside)), name)

@@ -81,7 +81,7 @@ USD_FORMATS = {
     "usd": MeshFormat(OCTET_STREAM, still_usd, polygons=True),
     "usdz": MeshFormat("model/vnd.usdz+zip", partial(still_usd, packed=True), polygons=True),
 }
-#: VTK's files of polygons, legacy and XML. Writing and reading them needs the package ``vtk``.
+#: VTK's files of polygons, legacy and XML. Writing them needs the package ``vtk``.
 VTK_FORMATS = {
     "vtk": MeshFormat(READ_FORMATS["vtk"], write_vtk, polygons=True),
     "vtp": MeshFormat(READ_FORMATS["vtp"], write_vtp, polygons=True),

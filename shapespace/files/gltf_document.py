@@ -25,8 +25,10 @@ from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most levels of nodes. Programs that model write far fewer.
 _MOST_LEVELS = 100
-#: Prefixes of extensions that change no triangle, so that a file may require them.
-_APPEARANCE = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
+#: Extensions that change no triangle, so that a file may require them.
+_APPEARANCE = re.compile(
+    "VRM|MSFT_texture|(KHR|EXT)_(materials|texture|lights|xmp|audio|animation_pointer|mesh_(features|manifold)|struct)"
+)
 #: Extension that allows positions as integers. It is implemented here.
 _QUANTIZATION = "KHR_mesh_quantization"
 #: NumPy types of component types, and components of element types (3.6.2.2).
@@ -64,7 +66,7 @@ def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
         raise MeshError(f"it has GLB version {version}, but only version 2 can be read")
     if not 20 + size <= length <= len(data):
         raise ValueError(f"it should have {length} bytes, but has {len(data)}")
-    text, rest = data[20 : 20 + size], data[20 + size : length]
+    text, rest = memoryview(bytes(data[20 : 20 + size]).rstrip(b"\0")), data[20 + size : length]  # zeros may follow
     if len(rest) < 8:
         return text, None
     size, kind = struct.unpack_from("<I4s", rest)
@@ -87,10 +89,17 @@ def _parse(text: memoryview) -> tuple[dict[str, Any], list[memoryview]]:
         pieces += [text[place:start], b"data:%d" % len(uris)]
         uris.append(text[start:stop])
         place = stop
-    tree = json.loads(b"".join([*pieces, text[place:]]))
+    content = b"".join([*pieces, text[place:]])
+    # Some programs write null for what is not there.
+    tree = json.loads(content, object_hook=lambda o: {k: o[k] for k in o if o[k] is not None}, parse_float=_number)
     if not isinstance(tree, dict):
         raise ValueError("its JSON is not an object")
     return tree, uris
+
+
+def _number(text: str) -> float:
+    """Return a number; some programs write 3.0 for 3."""
+    return int(value) if (value := float(text)).is_integer() else value
 
 
 class GltfDocument:
@@ -107,11 +116,10 @@ class GltfDocument:
 
     def __init__(self, tree: dict[str, Any]) -> None:
         self.tree = tree
-        version = clipped(tree.get("asset", {}).get("version", "2.0"))
-        if version.partition(".")[0] != "2":
-            raise MeshError(f"it has glTF version {version}, but only version 2 can be read")
+        if str(tree.get("asset", {}).get("version", "2.0")).partition(".")[0] != "2":
+            raise MeshError("it has another version of glTF, but only version 2 can be read")
         required = [name for name in tree.get("extensionsRequired", []) if name != _QUANTIZATION]
-        unknown = [name for name in required if not name.startswith(_APPEARANCE)]
+        unknown = [name for name in required if not _APPEARANCE.match(name)]
         if unknown:
             raise MeshError(
                 f"it requires {clipped(', '.join(unknown))}, which can't be read: export it without this extension"
@@ -132,7 +140,7 @@ class GltfDocument:
         for node in self.nodes:
             for child in node.get("children", []):
                 if child in children:
-                    raise MeshError(f"its node {clipped(child)} lies in two others")
+                    raise MeshError("one of its nodes lies in two others")
                 children.add(child)
         if not self._scenes:
             return [k for k in range(len(self.nodes)) if k not in children]
@@ -180,7 +188,7 @@ class PlacedMesh:
     def joint_place(self, number: int) -> FloatArray:
         """Return the matrix (4, 4) of a joint; raises ValueError if it is not in the scene."""
         if number not in self.places:
-            raise ValueError(f"its joint {clipped(number)} is not a node of the scene")
+            raise ValueError("a joint of its skin is not a node of the scene")
         place = self.places[number]
         return np.eye(4) if place is None else place
 
@@ -195,14 +203,15 @@ def objects(tree: dict[str, Any], name: str) -> list[dict[str, Any]]:
 
 def entry_at(entries: list[dict[str, Any]], index: object) -> dict[str, Any]:
     """Return the entry at an index; raises ValueError if it is not an index of an entry."""
-    if _natural(index) >= len(entries):
-        raise ValueError(f"it refers to entry {clipped(index)} of a list that has {len(entries)}, counted from 0")
-    return entries[_natural(index)]
+    number = _natural(index)
+    if number >= len(entries):
+        raise ValueError(f"it refers to entry {number} of a list that has {len(entries)}, counted from 0")
+    return entries[number]
 
 
 def _natural(value: object) -> int:
-    if type(value) is not int or value < 0:
-        raise ValueError(f"{clipped(value)} stands where a whole number should")
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ValueError("something else stands where a whole number from 0 should")
     return value
 
 
@@ -219,7 +228,7 @@ def _matrix(node: dict[str, Any]) -> FloatArray | None:
         matrix[:3, 3] = _numbers(node["translation"], 3)
     if "matrix" in node:
         given = _numbers(node["matrix"], 16).reshape(4, 4).T
-        if (given[3] != [0, 0, 0, 1]).any():
+        if not np.allclose(given[3], [0, 0, 0, 1], atol=1e-5):
             raise ValueError("the last row of a matrix is not 0, 0, 0, 1")
         matrix = given @ matrix
     return None if np.array_equal(matrix, np.eye(4)) else matrix
@@ -238,7 +247,7 @@ def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
 def _numbers(value: object, length: int) -> FloatArray:
     numbers = np.array(value, np.float64)
     if numbers.shape != (length,):
-        raise ValueError(f"{length} numbers are needed in a node, not {clipped(value)}")
+        raise ValueError(f"{length} numbers are needed in a node, not something else")
     return numbers
 
 
@@ -292,7 +301,7 @@ class Accessor:
         dtype, width = np.dtype(_DTYPES[component]), _WIDTHS[kind]
         size = width * dtype.itemsize
         view = entry_at(document.views, entry["bufferView"])
-        stride, inside = _natural(view.get("byteStride", size)), _natural(entry.get("byteOffset", 0))
+        stride, inside = _natural(view.get("byteStride") or size), _natural(entry.get("byteOffset", 0))
         if not count or not size <= stride <= _LARGEST_STRIDE:
             raise ValueError(f"its {name} has {count} elements, {stride} bytes apart")
         start, length = _natural(view.get("byteOffset", 0)), _natural(view["byteLength"])

@@ -26,7 +26,7 @@ from shapespace.files.gltf_document import (
     objects,
     read_document,
 )
-from shapespace.files.limits import UNLIMITED, Limits, clipped, label
+from shapespace.files.limits import UNLIMITED, Limits, label
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most primitives of a scene, counted at each of their places.
@@ -310,7 +310,7 @@ def _placed_primitive(
 ) -> PlacedPrimitive:
     mode, attributes = primitive.get("mode", _TRIANGLES), primitive["attributes"]
     if mode not in (_TRIANGLES, _STRIP, _FAN):
-        raise ValueError(f"{clipped(mode)} is no mode of a primitive")
+        raise ValueError("a primitive has an unknown mode")
     positions = Accessor.of(document, attributes["POSITION"], "VEC3", _POSITIONS)
     indices = None
     if "indices" in primitive:
@@ -342,6 +342,8 @@ def _targets(
         weight = float(weights[k]) if k < len(weights) else 0.0
         if "POSITION" not in target or not (weight or every_target):
             continue
+        if not entry_at(document.accessors, target["POSITION"]).keys() & {"bufferView", "sparse"}:
+            continue  # zeros, as Blender leaves them out
         moves = Accessor.of(document, target["POSITION"], "VEC3", _POSITIONS)
         if moves.count != vertices:
             raise ValueError(f"a morph target has {moves.count} of {vertices} vertices")

@@ -1,9 +1,10 @@
-"""Limits on the size of a mesh, text from files (its encoding, and how messages quote it), and errors of the system."""
+"""Limits on the size of a mesh, text from files (its encoding, and names in messages), and errors of the system."""
 
 from __future__ import annotations
 
 import errno
 import re
+import struct
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,17 +54,13 @@ def label(text: object) -> str | None:
     return clipped("".join(c if c.isprintable() else " " for c in str(text)[:1000])) or None
 
 
-def quoted(text: str) -> str:
-    """Return text from a file in quotation marks, shortened; bytes that are no text are not repeated."""
-    line = clipped(text)
-    return repr(line) if line.isprintable() and "\ufffd" not in line else "no text"
-
-
 def reason(error: Exception) -> str:
-    """Return the message of an error on one line, shortened, unless it repeats bytes that are no text."""
+    """Return the message of an error on one line, shortened, unless it repeats what stands in the file."""
     line = clipped(error, 300)
     unfit = (
-        not line.isprintable() or "\ufffd" in line or re.search(r"\\x[0-9a-f]|\\0|codec can't|invalid literal", line)
+        isinstance(error, LookupError | TypeError | AttributeError | RecursionError | struct.error)
+        or not line.isprintable()
+        or re.search(r"\\x[0-9a-f]|\\0|\ufffd|codec can't|invalid literal|could not convert", line)
     )
     return "it is damaged, or another kind of file" if unfit else line
 

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, clipped
+from shapespace.files.limits import Limits
 from shapespace.mesh.triangle_mesh import MeshError
 
 _HEAD = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE)
@@ -61,7 +61,7 @@ def read_pcd(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         columns_of = zip(axes, offsets, strict=True)
         found = np.stack([np.ndarray((points,), row[k], content, offset)[:, 0] for k, offset in columns_of], axis=1)
     else:
-        raise MeshError(f"its data are {clipped(kind.decode(errors='replace'))}, which can't be read: save it as ascii")
+        raise MeshError("its data are neither ascii, binary nor binary_compressed: save it as ascii")
     if len(found) != points:
         raise ValueError(f"it should have {points} points, but has {len(found)}")
     return found[~np.isnan(found).any(axis=1)].astype(np.float64), np.zeros((0, 3), np.int64)
@@ -84,14 +84,15 @@ def _decompressed(data: memoryview, size: int) -> bytearray:
             place += 1
         start = len(out) - ((control & 31) << 8) - data[place] - 1
         place += 1
-        if start < 0:
-            raise ValueError("its compressed data are damaged")
-        length += 2
-        if start + length <= len(out):
-            out += out[start : start + length]
-        else:
-            pattern = bytes(out[start:])
-            out += (pattern * (length // len(pattern) + 1))[:length]
+        repeat(out, start, length + 2)
     if len(out) != size:
         raise ValueError(f"its compressed data make {len(out)} of {size} bytes")
     return out
+
+
+def repeat(out: bytearray, start: int, length: int) -> None:
+    """Append bytes that begin at ``start``, over and over; raises ValueError if there are none."""
+    pattern = bytes(out[start : start + length]) if start >= 0 else b""
+    if not pattern:
+        raise ValueError("its compressed data are damaged")
+    out += (pattern * (length // len(pattern) + 1))[:length]

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from array import array
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits, as_utf8, clipped
-from shapespace.files.polygon_reading import Lines, TriangleFans, first_values
+from shapespace.files.polygon_reading import Lines, TriangleFans, first_values, reals, whole
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes at the start of a file in which its header has to end.
@@ -26,6 +28,7 @@ _DTYPES = {
 }  # fmt: skip
 #: The start of a header whose lines end in a carriage return alone.
 _CARRIAGE_RETURNS = re.compile(rb"[^\r\n]*\r(?!\n)")
+_HEAD_WANTED = "it should name a format, an element with its number of rows, or a property of a known type"
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
 
 
@@ -86,14 +89,27 @@ class PlyElement:
 
 
 def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
-    """Return vertices (V, 3) and faces (F, 3) of a PLY file; other elements are ignored."""
-    text, elements, body = read_header(data)
-    table = TextTable(body, limits) if text else BinaryTable(body, limits)
-    vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # Elements after these two are not read.
-    wanted = {element.name for element in elements if element.rows} & {"vertex", "face"}
+    """Return vertices (V, 3) and faces (F, 3) of a PLY file; elements with neither are ignored.
+
+    In a text, each row should have a line. If rows go on in the next line, or share one, only numbers count.
+    """
+    try:
+        return _read(*open_table(data, limits), limits)
+    except (ValueError, LookupError, EOFError) as error:
+        elements, table = open_table(data, limits)
+        if isinstance(error, MeshError) or not isinstance(table, TextTable):
+            raise
+        with suppress(ValueError, LookupError, EOFError):
+            return _read(elements, NumbersTable(table), limits)
+        raise
+
+
+def _read(elements: list[PlyElement], table: TextTable | BinaryTable, limits: Limits) -> tuple[FloatArray, IntArray]:
+    vertices, faces, strips = np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64)
+    # Elements after these are not read, unless all numbers of a text have to be.
+    wanted = {element.name for element in elements if element.rows} & {"vertex", "face", "tristrips"}
     for element in elements:
-        if not wanted:
+        if not (wanted or isinstance(table, NumbersTable)):
             break
         if element.name == "vertex":
             limits.check(element.rows, 0)
@@ -101,35 +117,56 @@ def read_ply(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         elif element.name == "face" and element.rows:
             limits.check(0, element.rows)
             faces = table.polygons(element)
+        elif element.name == "tristrips" and element.rows:
+            corners = chain.from_iterable(
+                (-1, *map(int, strip)) for (strip,) in table.lists(element, [element.corners])
+            )
+            strips = strip_triangles(np.fromiter(corners, np.int64))
+            limits.check(0, len(strips))
         else:
             table.skip(element)
         wanted.discard(element.name)
-    if not len(faces) and any(element.name == "tristrips" and element.rows for element in elements):
-        raise MeshError("its faces are triangle strips (tristrips), which are not read: save it with faces")
-    return vertices, faces
+    table.close()
+    return vertices, faces if len(faces) else strips
 
 
-def read_header(data: memoryview) -> tuple[bool, list[PlyElement], memoryview]:
-    """Return whether a file is ASCII, its elements, and the content after its header."""
+def strip_triangles(corners: IntArray) -> IntArray:
+    """Return the triangles (F, 3) of strips (n,), which −1 separates; triangles without area join strips."""
+    windows = np.stack([corners[k : max(len(corners) - 2 + k, 0)] for k in range(3)], axis=1)
+    places = np.arange(len(windows))
+    # Every second triangle of a strip is turned over.
+    begins = np.maximum.accumulate(np.where(windows[:, 0] == -1, places + 1, 0))
+    odd = (places - begins) % 2 == 1
+    windows[odd] = windows[odd][:, [0, 2, 1]]
+    kept = (windows != -1).all(axis=1) & (windows != np.roll(windows, 1, axis=1)).all(axis=1)
+    found: IntArray = windows[kept]
+    return found
+
+
+def open_table(data: memoryview, limits: Limits) -> tuple[list[PlyElement], TextTable | BinaryTable]:
+    """Return the elements of a file, and the table with their rows."""
     data = as_utf8(data)
     head = bytes(data[:_LONGEST_HEADER])
     end = re.search(rb"(?<=[\r\n])end_header[ \t]*" + (rb"\r" if _CARRIAGE_RETURNS.match(head) else rb"\r?\n"), head)
     if not head[:3].lower() == b"ply" or not end:
         raise ValueError("damaged, or another kind of file")
     order, elements = None, list[PlyElement]()
-    for line in head[: end.start()].splitlines():
-        match line.split():
-            case [b"format", kind, _]:
-                order = _BYTE_ORDERS[kind]
-            case [b"element", name, rows]:
-                elements.append(PlyElement(name.decode("latin-1"), int(rows), []))
-            case [b"property", b"list", length, kind, name, *more]:
-                elements[-1].properties.append(_property(b" ".join([name, *more]), kind, length, order))
-            case [b"property", kind, name, *more]:
-                elements[-1].properties.append(_property(b" ".join([name, *more]), kind, None, order))
+    for number, line in enumerate(head[: end.start()].splitlines(), 1):
+        try:
+            match line.split():
+                case [b"format", kind, *_]:
+                    order = _BYTE_ORDERS[kind]
+                case [b"element", name, rows]:
+                    elements.append(PlyElement(name.decode("latin-1"), int(rows), []))
+                case [b"property", b"list", length, kind, name, *more]:
+                    elements[-1].properties.append(_property(b" ".join([name, *more]), kind, length, order))
+                case [b"property", kind, name, *more]:
+                    elements[-1].properties.append(_property(b" ".join([name, *more]), kind, None, order))
+        except (ValueError, LookupError):
+            raise ValueError(f"line {number} of its head can't be read: {_HEAD_WANTED}") from None
     if order is None or len({e.name for e in elements}) < len(elements) or any(e.rows < 0 for e in elements):
         raise ValueError("its head is damaged")
-    return order == "", elements, data[end.end() :]
+    return elements, BinaryTable(data[end.end() :], limits) if order else TextTable(data, limits, end.end())
 
 
 def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None) -> PlyProperty:
@@ -140,50 +177,90 @@ def _property(name: bytes, kind: bytes, length: bytes | None, order: str | None)
 
 
 class TextTable:
-    """Rows of an ASCII file, one on each line, after its header.
+    """Rows of an ASCII file, one on each line, after its header, which ends at ``start``.
 
     Elements have to be read or skipped in their order in the file.
     """
 
-    def __init__(self, data: memoryview, limits: Limits) -> None:
-        self._limits, self._lines = limits, Lines(data)
+    def __init__(self, data: memoryview, limits: Limits, start: int) -> None:
+        self.limits, self.lines = limits, Lines(data, "", start=start)
+
+    def _rows(self, element: PlyElement) -> Iterator[list[bytes]]:
+        """Yield the values of each row."""
+        names = clipped(" ".join(p.name for p in element.properties))
+        self.lines.wanted = f"a row of {clipped(element.name)} has the values of {names}"
+        for _ in range(element.rows):
+            yield self._row(element)
+
+    def _row(self, element: PlyElement) -> list[bytes]:
+        return self.lines.next().split()
+
+    def close(self) -> None:
+        """Tell that nothing more is needed."""
 
     def skip(self, element: PlyElement) -> None:
         """Skip the rows of an element."""
-        with self._lines:
-            self._lines.skip(element.rows)
+        self.lines.skip(element.rows)
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
         """Return the properties ``which`` of an element, which are no lists, (rows, k)."""
         values = array("d")
-        with self._lines:
-            for _ in range(element.rows):
-                row = self._lines.next().split()
+        with self.lines:
+            for row in self._rows(element):
                 for k in element.lists:  # shortens each list to its length, so that properties keep their indices
                     row[k + 1 : k + 1 + int(row[k])] = []
-                values.extend(float(row[k]) for k in which)
+                values.extend(reals([row[k] for k in which], len(which)))
         return np.array(values, np.float64).reshape(-1, len(which))
 
     def polygons(self, element: PlyElement) -> IntArray:
         """Return the polygons in the rows of an element as triangles (F, 3)."""
-        triangles = TriangleFans(self._limits)
-        with self._lines:
-            for (corners,) in self.lists(element, [element.corners]):
-                triangles.add([int(value) for value in corners])
+        triangles, corners = TriangleFans(self.limits), element.corners
+        with self.lines:
+            for (polygon,) in self.lists(element, [corners]):
+                triangles.add(whole(polygon))
         return triangles.faces
 
     def lists(self, element: PlyElement, which: Sequence[int]) -> Iterator[list[Sequence[bytes]]]:
         """Yield the lists ``which`` of each row."""
-        for _ in range(element.rows):
-            row, start, found = self._lines.next().split(), 0, dict[int, Sequence[bytes]]()
-            for k, p in enumerate(element.properties[: max(which) + 1]):
-                if p.length is None:
-                    start += 1
-                    continue
-                if k in which:
-                    found[k] = first_values(int(row[start]), row[start + 1 :])
-                start += 1 + int(row[start])
-            yield [found[k] for k in which]
+        with self.lines:
+            for row in self._rows(element):
+                start, found = 0, dict[int, Sequence[bytes]]()
+                for k, p in enumerate(element.properties[: max(which) + 1]):
+                    if p.length is None:
+                        start += 1
+                        continue
+                    (length,) = whole(row[start : start + 1])
+                    if k in which:
+                        found[k] = first_values(length, row[start + 1 :])
+                    start += 1 + length
+                yield [found[k] for k in which]
+
+
+class NumbersTable(TextTable):
+    """Rows of an ASCII file whose lines don't matter; with the methods of `TextTable`."""
+
+    def __init__(self, table: TextTable) -> None:
+        self.limits, self.lines = table.limits, table.lines
+        self._values = chain.from_iterable(line.split() for line in self.lines)
+
+    def _row(self, element: PlyElement) -> list[bytes]:
+        row: list[bytes] = []
+        for p in element.properties:
+            (value,) = values = [*islice(self._values, 1)]
+            row += values
+            if p.length is not None:
+                row += first_values(int(value), [*islice(self._values, max(int(value), 0))])
+        return row
+
+    def skip(self, element: PlyElement) -> None:
+        """Skip the rows of an element."""
+        for _ in self._rows(element):
+            pass
+
+    def close(self) -> None:
+        """Raise ValueError if there are more numbers than the header says."""
+        if next(self._values, None) is not None:
+            raise ValueError("more numbers than it says")
 
 
 class BinaryTable:
@@ -209,11 +286,15 @@ class BinaryTable:
             raise ValueError(f"it says {element.rows} rows of {clipped(element.name)}, and ends before")
         return np.ndarray((element.rows,), row, self._data, self._place)
 
+    def close(self) -> None:
+        """Tell that nothing more is needed."""
+
     def skip(self, element: PlyElement) -> None:
         """Skip the rows of an element."""
-        if element.lists:
-            raise ValueError(f"its {clipped(element.name)} rows, which come before the faces, have lists")
-        self._place += self._equal_rows(element).nbytes
+        if not element.lists:
+            self._place += self._equal_rows(element).nbytes
+            return
+        self._spans(element, 0)
 
     def columns(self, element: PlyElement, which: Sequence[int]) -> FloatArray:
         """Return the properties ``which`` of an element, which are no lists, (rows, k)."""
@@ -251,9 +332,10 @@ class BinaryTable:
             self._place += rows.nbytes
             return rows[f"{corners}"].astype(np.int64)
         starts, sizes = self._spans(element, which)
-        if sizes.min() < 3:
+        if sizes.min() < 1:
             raise ValueError(f"a face has {sizes.min()} corners")
-        ends = np.cumsum(sizes - 2)
+        # Points and lines, which have fewer corners, are left out.
+        ends = np.cumsum(np.maximum(sizes - 2, 0))
         self._limits.check(0, int(ends[-1]))
         faces = np.empty((ends[-1], 3), np.int64)
         kind = element.properties[corners].type

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from shapespace.arrays import FloatArray
-from shapespace.files.limits import quoted
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Words for the three axes in the names of columns.
@@ -61,9 +60,7 @@ def named_columns(names: Sequence[str]) -> tuple[int, int, int] | None:
         for sets in ranks:
             complete = [columns for columns in sets.values() if len(columns) == 3]
             if len(complete) > 1 or any(len(columns) > 1 for one in complete for columns in one.values()):
-                raise MeshError(
-                    f"its header {quoted(', '.join(names))} names two sets of columns x, y and z: keep one of them"
-                )
+                raise MeshError("its header names two sets of columns x, y and z: keep one of them")
             if complete:
                 return complete[0][0][0], complete[0][1][0], complete[0][2][0]
     return None
@@ -94,7 +91,7 @@ def _axis(name: str, axes: Mapping[str, int]) -> tuple[int, int, frozenset[str]]
 def row_numbers(rows: Sequence[Sequence[str]], start: int, where: str) -> int:
     """Number of columns with row numbers in front of the coordinates, from column ``start`` of rows of text.
 
-    The message of an error starts with ``where``, the first line.
+    The message of an error starts with ``where``, the number of the first line.
 
     Raises:
         MeshError: the first columns may be row numbers or coordinates.
@@ -120,12 +117,9 @@ def row_numbers(rows: Sequence[Sequence[str]], start: int, where: str) -> int:
         second = np.array([value.replace(",", ".") for value in columns[1]], np.float64)
         if all(len(set(np.sign(np.diff(values)))) == 1 and values[0] != values[1] for values in (first, second)):
             return 2
-    drop = in_front if in_front < 3 else 1
-    values = rows[0][start:]
     raise MeshError(
-        f"{where}, can be read as ({', '.join(values[:3])}) and, behind a row number, as "
-        f"({', '.join(values[drop : drop + 3])}): delete the row numbers, or write a first line that names each "
-        "column, with x, y and z"
+        f"{where} can begin with x, y and z, or with a row number: delete the row numbers, or write a first line that "
+        "names each column, with x, y and z"
     )
 
 

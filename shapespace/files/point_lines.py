@@ -1,16 +1,16 @@
-"""Lines of a text with points: which are points, and how messages show them."""
+"""Lines of a text with points: which are points, and what messages say about the others."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-from shapespace.files.limits import quoted
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Characters of a line.
 _LONGEST_LINE = 2**16
-_LINE = re.compile(r"[^\s][^\r\n]*")
+#: A line, or one with separators alone, as spreadsheets write for rows without values.
+_LINE = re.compile(r"[,;|][ \t,;|]*+(?=[\r\n]|\Z)|([^\s][^\r\n]*)")
 REMARK = re.compile(r"#|//|%|!")
 WHOLE = re.compile(r"[+-]?\d+")
 POINT_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)", re.IGNORECASE)
@@ -27,6 +27,8 @@ _LABEL = re.compile(r'^(?=[^,;\t]*[^\W\d])(?:[^,;\t"]*[,;\t]|"[^"]*"[\s,;]|\S+\s
 def lines(text: str) -> Iterator[tuple[int, str]]:
     """Lines that are not blank, without blanks at their ends, each with the place in the text where it starts."""
     for match in _LINE.finditer(text):
+        if match[1] is None:
+            continue
         if match.end() - match.start() > _LONGEST_LINE:
             raise MeshError(f"line {line_number(text, match.start())} has more than {_LONGEST_LINE} characters")
         yield match.start(), match[0].rstrip()
@@ -71,10 +73,10 @@ def is_beside(line: str) -> bool:
 
 def fault(text: str, place: int, line: str, beside: tuple[int, str] | None = None) -> ValueError:
     """Error of a line that is no point, or is written otherwise than a line before."""
-    says = f"line {line_number(text, place)} is {quoted(line)}"
+    says = f"line {line_number(text, place)}"
     if beside is not None and (is_point(line, False) or is_point(line, True)):
         return ValueError(
-            f"{says}, and line {line_number(text, beside[0])} is {quoted(beside[1])}: write all lines in the same way, "
+            f"{says} is written otherwise than line {line_number(text, beside[0])}: write all lines in the same way, "
             "with decimal points"
         )
-    return ValueError(f"{says}, which does not begin with three numbers: write x, y and z there, with decimal points")
+    return ValueError(f"{says} does not begin with three numbers: write x, y and z there, with decimal points")

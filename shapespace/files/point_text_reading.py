@@ -1,7 +1,7 @@
 """Point clouds as text: XYZ, PTS, CSV and TXT in the dialects of scanners, spreadsheets and ParaView.
 
 Such a file does not name its dialect. `_Dialect.of` finds it in the first lines: the separator of columns, a decimal
-comma, and the columns of x, y and z. A file that can be read in two ways is refused, and the message shows both.
+comma, and the columns of x, y and z. A file that can be read in two ways is refused, and the message tells both.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
-from shapespace.files.limits import Limits, as_utf8, quoted
+from shapespace.files.limits import Limits, as_utf8
 from shapespace.files.point_columns import header_names, named_columns, row_numbers, uncounted
 from shapespace.files.point_lines import (
     POINT_NUMBER,
@@ -50,7 +50,7 @@ def read_point_text(data: memoryview, limits: Limits) -> tuple[FloatArray, IntAr
 
     Raises:
         MeshError: the text can be read in two ways, or has more points than the limits allow.
-        ValueError: a line is no point; the message shows the line.
+        ValueError: a line is no point; the message tells its number.
     """
     text = _decoded(as_utf8(data))
     points, counts = _Dialect.of(text).read(text)
@@ -121,8 +121,7 @@ class _Dialect:
             # Such a line is no header: it has a label where later lines have none.
             if not label and not is_beside(line) and is_point(line, True) and len(found.split(line)) == len(rows[0]):
                 raise fault(text, place, line, beside=sample[0])
-        place, line = sample[0]
-        return found._with_columns(rows, heads, f"line {line_number(text, place)}, {quoted(line)}")
+        return found._with_columns(rows, heads, f"line {line_number(text, sample[0][0])}")
 
     @classmethod
     def _by_header(cls, text: str) -> _Dialect | None:
@@ -179,32 +178,31 @@ class _Dialect:
             decimals = [value for row in rows for value in row if "," in value]
             if not decimals or not all(map(_THOUSANDS.fullmatch, decimals)):
                 return self
-            other = [value.replace(",", "") for value in rows[0]]
+            others = "between thousands"
         else:
             splits = [header_names(head, "," if "," in head else None) for head in heads]
             named = {len(names) - start for names in splits if named_columns(names)}
             readings = [_with_decimals(row) for row in rows]
-            others = [reading for reading in readings if reading is not None]
-            if len(others) < len(rows) or len(rows[0]) in named or {len(row) for row in rows} == {3}:
+            found = [reading for reading in readings if reading is not None]
+            if len(found) < len(rows) or len(rows[0]) in named or {len(row) for row in rows} == {3}:
                 return self
-            if named & {3, len(others[0])} and all(
-                len(row) == 2 * len(reading) for row, reading in zip(rows, others, strict=True)
+            if named & {3, len(found[0])} and all(
+                len(row) == 2 * len(reading) for row, reading in zip(rows, found, strict=True)
             ):
                 return replace(self, decimal_comma=True, paired=True, plain=False)
             if len({len(row) for row in rows}) == 1 and len(rows[0]) == 4:
                 return self
-            other = others[0]
-        values = [value.replace(",", ".") for value in rows[0]]
+            others = "between columns"
         raise MeshError(
-            f"line {line_number(text, sample[0][0])}, {quoted(sample[0][1])}, can be read as ({', '.join(values[:3])}) "
-            f"and as ({', '.join(other[:3])}): write decimals with a point, or separate columns by semicolons"
+            f"the commas of line {line_number(text, sample[0][0])} can stand before decimals or {others}: write "
+            "decimals with a point, or separate columns by semicolons"
         )
 
     def _with_columns(self, rows: list[list[str]], heads: list[str], where: str) -> _Dialect:
         """This dialect with the columns that a header names, or those behind row numbers."""
         width, start = len(rows[0]), int(self.label)
         separators = [self.separator.strip(" ") if self.separator else "\t", ",", ";", None]
-        unknown = None
+        unknown = False
         for head in reversed(heads):
             splits = [header_names(head, one) for one in separators if one is None or one in head]
             names = min(splits, key=lambda names: (len(names) != width, named_columns(names) is None))
@@ -214,15 +212,13 @@ class _Dialect:
                 return replace(self, columns=columns)
             if columns and not remark:
                 if columns != (0, 1, 2) and width > 3:
-                    raise MeshError(f"its header {quoted(head)} names {len(names)} columns, and a point has {width}")
-                unknown = None
+                    raise MeshError(f"its header names {len(names)} columns, and a point has {width}")
+                unknown = False
                 break
             words = len(names) == width > 3 + start and not any(map(_NUMBER_FIRST.match, names))
-            unknown = unknown or (head if words and not remark else None)
+            unknown = unknown or (words and not remark)
         if unknown:
-            raise MeshError(
-                f"its header {quoted(unknown)} does not tell the columns of the coordinates: name them x, y and z"
-            )
+            raise MeshError("its header does not tell the columns of the coordinates: name them x, y and z")
         numbers = row_numbers([[v.replace(",", ".") for v in row] for row in rows], start, where)
         x = start + numbers
         return replace(self, columns=(x, x + 1, x + 2), numbers=tuple(range(start, x)))
@@ -287,10 +283,8 @@ class _Dialect:
         for column in range(len(self.numbers)):
             k = uncounted(found[:, column])
             if k is not None:
-                place, line = next(islice(self._rows(text, []), k, None))
-                raise ValueError(
-                    f"its first column counts the points, but not in line {line_number(text, place)}, {quoted(line)}"
-                )
+                place, _ = next(islice(self._rows(text, []), k, None))
+                raise ValueError(f"its first column counts the points, but not in line {line_number(text, place)}")
         return found[:, len(self.numbers) :].copy() if self.numbers else found, counts
 
     def _values(self, text: str, counts: list[int]) -> Iterator[str]:
@@ -309,9 +303,7 @@ class _Dialect:
                 if self.label and not _DIGITS.search(row[0]):
                     words.add(row[0])
                     if len(words) > 1 and row[0] in ("v", "vn", "vt", "vp", "f", "l"):
-                        raise MeshError(
-                            f"line {line_number(text, place)}, {quoted(line)}, is a line of OBJ: name it .obj"
-                        )
+                        raise MeshError(f"line {line_number(text, place)} is a line of OBJ: name it .obj")
                 values = " ".join(row[k] for k in wanted)
             yield values.replace(",", ".") if self.decimal_comma else values
 

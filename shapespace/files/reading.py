@@ -20,7 +20,8 @@ from shapespace.files.ply_reading import read_ply
 from shapespace.files.point_text_reading import read_point_text
 from shapespace.files.polygon_reading import read_obj, read_off, read_stl
 from shapespace.files.recognition import FormatError, decide
-from shapespace.files.vtk_reading import read_vtk, read_vtp
+from shapespace.files.vtk_reading import read_vtk
+from shapespace.files.vtk_xml_reading import read_vtp
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Media type of formats that have none registered at IANA.
@@ -35,6 +36,7 @@ READ_FORMATS = {
     "npz": OCTET_STREAM,
     "off": OCTET_STREAM,
     "vtk": OCTET_STREAM,
+    "vtu": OCTET_STREAM,
     "vtp": OCTET_STREAM,
 }
 #: Media types of the formats of point clouds, which may have no faces.
@@ -47,7 +49,8 @@ SCAN_FORMATS = READ_FORMATS | {
 }
 #: Formats whose files can hold a collection as morph targets.
 MORPH_FORMATS = ("glb", "gltf")
-_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl, "vtk": read_vtk, "vtp": read_vtp}
+_READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl, "vtk": read_vtk}
+_READERS |= {"vtu": read_vtp, "vtp": read_vtp}
 
 
 def read_arrays(

@@ -27,6 +27,7 @@ _MAGIC = {
     "off": rb"\s*(?:#[^\n]*\n\s*)*(?i:(?:ST)?[CN]{0,2}OFF)[\s\d]",
     "pcd": rb"#\s*\.PCD\b|VERSION\s+[\d.]+\s+FIELDS\s",
     "vtk": rb"#\s*vtk DataFile",
+    "vtu": rb"\s*(?:<\?xml[^>]*>\s*)?<VTKFile\b[^>]*[\"']UnstructuredGrid[\"']",
     "vtp": rb"\s*(?:<\?xml[^>]*>\s*)?<VTKFile\b",
 }
 #: The start of files that are no meshes, or that are not read.
@@ -36,18 +37,30 @@ _FOREIGN = {
     "a PDF document": rb"%PDF",
     "a web page: download the file itself": rb"\s*(?i:<!doctype html|<html)",
     "packed by gzip: unpack it first": rb"\x1f\x8b",
+    "packed by bzip2: unpack it first": rb"BZh\d1AY",
+    "packed by xz: unpack it first": rb"\xfd7zXZ",
+    "packed by Zstandard: unpack it first": rb"\x28\xb5\x2f\xfd",
     "a 7z archive: unpack it first": rb"7z\xbc\xaf",
+    "a RAR archive: unpack it first": rb"Rar!\x1a",
+    "one NumPy array: save vertices and faces together by numpy.savez": rb"\x93NUMPY",
     "a USD file, which can be written but not read: save it as GLB or OBJ": rb"PXR-USDC|#usda",
     "an FBX file: save it as GLB or OBJ": rb"Kaydara FBX|; FBX",
     "a Blender file: export it as GLB or OBJ": rb"BLENDER",
     "a COLLADA file: save it as GLB or OBJ": rb"\s*(?:<\?xml[^>]*>\s*)?<COLLADA\b",
     "a GIFTI surface: save it as PLY or OBJ": rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!DOCTYPE GIFTI[^>]*>\s*)?<GIFTI\b",
-    "a FreeSurfer surface: save it as PLY or STL": rb"\xff\xff\xfe",
+    "a FreeSurfer surface: save it as PLY or STL": rb"\xff\xff\xfe|#!ascii version of ",
+    "a VRML file: save it as PLY or OBJ": rb"#VRML ",
+    "an X3D file: save it as PLY or OBJ": rb"\s*(?:<\?xml[^>]*>\s*)?(?:<!DOCTYPE X3D[^>]*>\s*)?<X3D\b",
+    "a Gmsh mesh: save it as STL or VTK": rb"\$MeshFormat\s",
+    "a Medit mesh: save it as OBJ or PLY": rb"\s*MeshVersionFormatted\s",
+    "a DXF drawing: save it as STL or OBJ": rb"(?:\s*999\r?\n[^\n]*\n)*\s*0\r?\n\s*SECTION\s",
+    "a STEP file: save it as STL": rb"ISO-10303-21;",
+    "a BVH motion without a mesh": rb"\s*HIERARCHY\s",
 }
 #: Members that come first in ZIP archives of other kinds.
 _FOREIGN_MEMBERS = {
     "a USDZ file, which can be written but not read: save it as GLB or OBJ": rb".*\.usd[ac]?$",
-    "a 3MF or an office file: save it as STL or OBJ": rb"\[Content_Types\]\.xml$|_rels/",
+    "a 3MF or an office file: save it as STL or OBJ": rb"\[Content_Types\]\.xml$|_rels/|3D/",
 }
 _VERTEX = re.compile(rb"^[ \t]*[vV](?:[ \t]+" + _NUMBER + rb"){3}", re.MULTILINE)
 _POINT = re.compile(rb'^[ \t"]*' + _NUMBER + rb'(?:[\s",;]+' + _NUMBER + rb"){2}", re.MULTILINE)

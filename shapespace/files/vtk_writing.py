@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +19,12 @@ if TYPE_CHECKING:
 
 #: Version of legacy files that every program reads. Few programs other than VTK read version 5.
 _LEGACY_VERSION = 42
+
+
+@cache
+def vtk_installed() -> bool:
+    """Return whether the package ``vtk`` is installed. Looked for once, because a look takes 0.1 ms."""
+    return find_spec("vtkmodules") is not None
 
 
 def write_vtk(

@@ -49,7 +49,7 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
         corners=surface.corners,
         uv=None if uv is None else uv * [1, -1] + [0, 1],
         uv_corners=None if uv is None else corners,
-        shading=None if normals is None else _labels(normals)[corners],
+        shading=None if normals is None else np.unique(_labels(normals)[corners], return_inverse=True)[1],
         normals=normals is not None,
         colors=None if colors is None else srgb(np.clip(colors[scene.first, :3], 0, 1)),
         objects=labelled([names[k] for k in parts.tolist()]),

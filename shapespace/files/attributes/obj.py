@@ -16,12 +16,15 @@ from shapespace.files.attributes.textures import Textures, beside
 from shapespace.files.colouring import Colouring
 from shapespace.files.gltf_writing import surface_normals
 from shapespace.files.limits import clipped, label, read_plain
-from shapespace.files.polygon_reading import Lines, joined_lines
+from shapespace.files.polygon_reading import OBJ_FACE, OBJ_VERTEX, Lines, joined_lines, whole
 from shapespace.mesh.attributes import NONE, Labels, MeshAttributes, SurfaceMaterial, labelled
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Normals that agree to this number of decimals are equal.
 _NORMAL_DECIMALS = 3
+#: The lines that OBJ and MTL should have.
+_WANTED = f"{OBJ_VERTEX}; {OBJ_FACE}, where a corner may be a/b/c"
+_MTL_WANTED = "Kd has three numbers, and d, Tr, Pm and Pr have one, with decimal points"
 #: Options of a map in MTL, with their largest number of values.
 _MAP_OPTIONS = {b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-texres": 1}
 _MAP_OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-colorspace": 1}
@@ -34,10 +37,10 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
     objects, groups, materials = list[str | None](), list[str | None](), list[str | None]()
     current: dict[bytes, str | None] = {b"o": None, b"g": None, b"usemtl": None}
     libraries, smooth, told, points = list[str](), 0, False, 0
-    with Lines(joined_lines(memoryview(path.read_bytes()))) as lines:
+    with Lines(joined_lines(memoryview(path.read_bytes())), _WANTED) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
-            keyword = keyword.lower() if keyword in (b"V", b"F") else keyword
+            keyword = keyword.lower() if keyword in (b"V", b"F", b"Fo") else keyword
             rest = values[0].partition(b"#")[0].strip() if values else b""
             if keyword == b"v":
                 row = rest.split()
@@ -49,7 +52,9 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
                 uv.extend((float(row[0]), float(row[1]) if len(row) > 1 else 0.0))
             elif keyword == b"vn":
                 normals.extend(float(value) for value in rest.split()[:3])
-            elif keyword == b"f":
+            elif keyword in (b"f", b"fo"):
+                if len(rest.split()) < 3:  # a point or a line
+                    continue
                 counts = points, len(uv) // 2, len(normals) // 3
                 for corner in rest.split():
                     numbers = [_number(text, count) for text, count in zip(corner.split(b"/"), counts, strict=False)]
@@ -101,10 +106,10 @@ def _number(text: bytes, count: int) -> int:
     """Return an index that counts from 0, or NONE for no text; negative numbers count back from ``count``."""
     if not text:
         return NONE
-    number = int(text) - 1 if int(text) > 0 else count + int(text)
-    if not 0 <= number < count:
+    (number,) = whole([text])
+    if number == 0 or number < -count:
         raise ValueError
-    return number
+    return number - 1 if number > 0 else count + number
 
 
 def _shading(
@@ -113,12 +118,13 @@ def _shading(
     """Return labels of corners, see `MeshAttributes.shading`, from normals, or else from smoothing groups."""
     if (of_normal >= 0).all():
         values = np.array(normals).reshape(-1, 3).round(_NORMAL_DECIMALS)
-        return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[of_normal]
+        labels = np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)[of_normal]
+        return np.unique(labels, return_inverse=True)[1]
     if not told:
         return None
     # Polygons of group 0 are flat.
     flat = smoothing.max() + 1 + np.arange(len(sizes))
-    labels: np.ndarray = np.unique(np.where(smoothing == 0, flat, smoothing), return_inverse=True)[1]
+    labels = np.unique(np.where(smoothing == 0, flat, smoothing), return_inverse=True)[1]
     return np.repeat(labels, sizes)
 
 
@@ -162,7 +168,7 @@ def _read_library(path: Path, textures: Textures, wanted: set[str]) -> dict[str,
             opacity = look.pop("opacity", 1.0)
             found[name] = SurfaceMaterial(name, (*color, opacity), texture=kept, **look)  # type: ignore[arg-type, misc]
 
-    with Lines(joined_lines(memoryview(read_plain(path)))) as lines:
+    with Lines(joined_lines(memoryview(read_plain(path))), _MTL_WANTED) as lines:
         for line in lines:
             keyword, *values = line.split(None, 1)
             if keyword == b"newmtl":

@@ -11,7 +11,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.attributes.obj import polygon_lines
 from shapespace.files.colouring import Colouring
 from shapespace.files.limits import UNLIMITED
-from shapespace.files.ply_reading import BinaryTable, TextTable, read_header
+from shapespace.files.ply_reading import open_table
 from shapespace.mesh.attributes import NONE, MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -22,8 +22,7 @@ _RGB = ("red", "green", "blue")
 
 def read(path: Path, faults: list[str]) -> MeshAttributes:
     """Read the attributes of a PLY file; appends a sentence to ``faults`` for everything left out."""
-    text, elements, body = read_header(memoryview(path.read_bytes()))
-    table = TextTable(body, UNLIMITED) if text else BinaryTable(body, UNLIMITED)
+    elements, table = open_table(memoryview(path.read_bytes()), UNLIMITED)
     at_vertices: FloatArray | None = None
     colors: FloatArray | None = None
     normals = False
@@ -44,6 +43,8 @@ def read(path: Path, faults: list[str]) -> MeshAttributes:
                 wanted.append(names.index("texcoord"))
             starts, corners, at_corners = [0], list[NDArray](), list[NDArray]()
             for polygon, *coordinates in table.lists(element, wanted):
+                if len(polygon) < 3:  # a point or a line
+                    continue
                 corners.append(np.array(polygon).astype(np.int64))
                 starts.append(starts[-1] + len(polygon))
                 if coordinates:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.files.attributes import gltf, obj, ply
-from shapespace.files.limits import as_utf8, clipped
+from shapespace.files.limits import as_utf8, reason
 from shapespace.files.mni_reading import is_mni
 from shapespace.files.recognition import START, decide
 from shapespace.mesh.attributes import MeshAttributes
@@ -43,7 +43,6 @@ def read_attributes(path: Path) -> tuple[MeshAttributes | None, list[str]]:
     except OSError:
         raise
     except Exception as error:  # damaged files raise exceptions of many classes
-        what = clipped(error, 200) or "it is damaged"
-        reason = str(error) if isinstance(error, MeshError) else f"it can't be understood: {what}"
-        return None, [f"its polygons, texture coordinates and materials are left out: {reason}"]
+        what = str(error) if isinstance(error, MeshError) else f"it can't be understood: {reason(error)}"
+        return None, [f"its polygons, texture coordinates and materials are left out: {what}"]
     return (None if surface.is_plain else surface), faults

@@ -47,7 +47,6 @@ def test_a_server_without_the_package_offers_no_vtk(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("format", VTK_FORMATS)
 def test_one_process_reads_several_files_within_its_memory(format: str) -> None:
-    """The package is loaded with the first file, and takes more memory than a mesh may."""
     content = VTK_FORMATS[format].encode(reference().vertices, reference().faces)
     with Sandbox(1) as sandbox:
         for _ in range(2):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io
+import lzma
 import zipfile
 from pathlib import Path
 
@@ -80,6 +82,20 @@ FOREIGN = {
     "a web page": b"\n<!DOCTYPE html><html>",
     "a USDZ file": archive("shape.usdc"),
     "a 3MF": archive("[Content_Types].xml", "3D/3dmodel.model"),
+    "a 3MF or an office": archive("3D/3dmodel.model", "[Content_Types].xml"),
+    "packed by bzip2": bz2.compress(b"v 1 2 3\n"),
+    "packed by xz": lzma.compress(b"v 1 2 3\n"),
+    "packed by Zstandard": b"\x28\xb5\x2f\xfd\x24\x08",
+    "a RAR archive": b"Rar!\x1a\7\0",
+    "one NumPy array": b"\x93NUMPY\1\0",
+    "a FreeSurfer surface: save": b"#!ascii version of lh.white\n3 1\n0 0 0 0\n1 0 0 0\n0 1 0 0\n0 1 2 0\n",
+    "a VRML file": b"#VRML V2.0 utf8\nShape {\n1 2 3,\n",
+    "an X3D file": b'<?xml version="1.0"?>\n<X3D profile="Interchange">',
+    "a Gmsh mesh": b"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n",
+    "a Medit mesh": b"MeshVersionFormatted 2\nDimension 3\nVertices\n1\n0 0 0 1\n",
+    "a DXF drawing": b"999\nmade by hand\n  0\r\nSECTION\r\n",
+    "a STEP file": b"ISO-10303-21;\nHEADER;\n",
+    "a BVH motion": b"HIERARCHY\nROOT Hips\nMOTION\n0 0 0 1 2 3\n",
     "a ZIP archive: unpack it first": archive("shape.obj"),
     "a FreeSurfer surface": b"\xff\xff\xfecreated by me",
     "a GIFTI surface": b'<?xml version="1.0"?>\n<!DOCTYPE GIFTI SYSTEM "gifti.dtd">\n<GIFTI Version="1.0">',
@@ -116,6 +132,29 @@ def test_no_reader_repeats_bytes_of_a_file(format: str, data: bytes) -> None:
     said = str(refusal.value)
     assert said.isprintable()
     assert not any(trace in said for trace in ("PNG", "\\x", "\ufffd", "IHDR"))
+
+
+#: A number that no message may repeat.
+N = "4711.0815"
+PLY = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+LINES = [
+    ("obj", f"v 1 2 {N}x\n"), ("off", f"OFF\n1 0 0\n{N} x 0\n"), ("off", f"{N}\n"), ("stl", f"vertex {N}x 2 3\n"),
+    ("ply", f"{PLY}{N} 2\n"), ("ply", PLY.replace("float z", f"{N} z")), ("ply", PLY.replace("ascii", N)),
+    ("csv", f'"{N}","8,811","5,808"\n'), ("csv", f"1,2,{N[:4]},4,5,6\n"), ("csv", f"{N},a\n"),
+    ("xyz", f"1 2 3\n{N} two 3\n"), ("xyz", f"7 {N} 2.5 3.5\n7 1.5 2.5 3.5\n"), ("txt", f"a{N} b c d\n1.5 2 3 4\n"),
+    ("txt", f"{N}\n"), ("pts", f"1.5 2 3\n{N},5 1,5 2,5\n"), ("pts", f"v {N} 2 3\nvn {N} 0 1\n"),
+    ("gltf", f'{{"asset": {{"version": "2.0"}}, "scene": "{N}", "scenes": [{{}}]}}'), ("gltf", f'{{"asset": {N}x}}'),
+    ("gltf", f'{{"asset": {{"version": "{N}"}}}}'), ("vtk", f"# vtk DataFile Version 3.0\n{N}\n"),
+    ("pcd", f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 {N}x\n"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("format", "text"), LINES)
+def test_no_message_repeats_a_line(format: str, text: str) -> None:
+    with pytest.raises(MeshError) as refusal:
+        read_arrays(text.encode(), format, points=True)
+    assert N[:4] not in str(refusal.value)
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig"])

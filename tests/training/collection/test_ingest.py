@@ -32,7 +32,7 @@ SHAPES = np.stack(
 def encoded(vertices: np.ndarray, faces: np.ndarray, format: str) -> bytes:
     if format == "off":
         return trimesh.Trimesh(vertices, faces, process=False).export(file_type="off").encode()
-    return (MESH_FORMATS | VTK_FORMATS)[format].encode(vertices, faces)
+    return (MESH_FORMATS | VTK_FORMATS)[format.replace("vtu", "vtp")].encode(vertices, faces)
 
 
 def write(
