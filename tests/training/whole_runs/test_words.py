@@ -17,10 +17,13 @@ import numpy as np
 import pytest
 
 from shapespace.files.formats import MESH_FORMATS
+from shapespace.model.decoder import Decoder
 from shapespace.training.commands import HOME
+from shapespace.training.learning import ExportError
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.stages.export import write_bundle_of
 from shapespace.training.stages.results import remember
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
@@ -357,3 +360,16 @@ def test_the_next_command_works_from_where_one_stands(
     assert (name, Path(value).resolve()) == ("SHAPESPACE_MODELS_DIR", (tmp_path / "run" / "models").resolve())
     assert words_of[0] == "make"
     subprocess.run([*words_of, "--dry-run"], check=True, capture_output=True, env={**os.environ, name: value})
+
+
+def test_a_model_without_shapes_inside_its_bounds_is_refused_in_words_of_training(
+    copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(decoder: Decoder) -> None:
+        decoder.shape(np.full(decoder.latents.dimension, 1e30, np.float32))
+
+    monkeypatch.setattr("shapespace.training.learning.export.measure_accuracy", measure)
+    with pytest.raises(
+        ExportError, match=r"has no shape, so the model is too poor.*What may help: more samples\.count"
+    ):
+        write_bundle_of(copy, {})
