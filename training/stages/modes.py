@@ -84,7 +84,7 @@ def _straighten(run: Run) -> None:
         "sparsity": 0.0,
         "pga_explained": explained,
         "linearised_logarithms": 0,
-        "asked": chosen["count"],
+        "asked": chosen["count"] if run.config.modes.count == "auto" else run.config.modes.count,
         "log_steps": 1,
         "steps": [1] * len(shapes),
     }

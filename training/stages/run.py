@@ -139,6 +139,8 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
         # before hours of work
         materials = directory.surface_names.read_if_written().get("materials", ())
         require_replaceable(run.bundle, [material["texture"] for material in materials])
+        if sentence := replaces_another(run):
+            show(sentence)
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
@@ -162,6 +164,18 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
         if name == until:
             break
     return done
+
+
+def replaces_another(run: Run) -> str:
+    """Return a sentence if the run will replace a bundle that it has not written; empty otherwise."""
+    own = f"{run.bundle.parent.name}/{run.bundle.name}"
+    written = any(event.get("event") == "exported" and event.get("bundle") == own for event in run.directory.events())
+    if written or not run.bundle.exists():
+        return ""
+    return (
+        f"{run.bundle} exists, and this run has not written it. The stage export will replace it. To keep it, set "
+        "another name or version under [export] in the configuration"
+    )
 
 
 def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
