@@ -92,7 +92,7 @@ def _serve(validator: BundleValidator) -> None:
 COMMAND = Subcommand(
     "serve",
     serve,
-    help="Start the server: web page and HTTP interface for the models of a folder.",
+    help="Start the server: web page and HTTP interface.",
     epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT set the address, and "
     "SHAPESPACE_MODELS_DIR the folder of models. docs/reference/settings.md lists all settings.",
     # All that is unknown together, so that the message names all of it.
