@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.bundle.writer import require_replaceable
+from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
@@ -186,8 +187,7 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
     data, known = _data_facts(run), directory.data.read_if_written()
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)
-    if source and known and not source.exists():
-        show(f"data: {source} does not exist any more; the run continues with the results of ingest")
+    if gone := bool(source and known and not source.exists()):
         data = known
     elif known and (changes := _changes(known, data)):
         show(f"data: {changes}; all stages from ingest on run again")
@@ -197,6 +197,11 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
             "benchmarks.studies in the repository"
         )
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
+    if gone:
+        if directory.stamp("ingest").read_if_written().get("key") != keys["ingest"]["key"]:
+            # Before results are removed.
+            raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
+        show(f"data: {source} does not exist any more; the run continues with the results of ingest")
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data

@@ -86,7 +86,7 @@ def test_status_of_a_stage_at_work_tells_its_samples(copy: Run, said: Said) -> N
     lines = log.read_text().splitlines()
     at = max(k for k, line in enumerate(lines) if '"samples of factor 1"' in line)
     log.write_text("\n".join(lines[: at + 1]))
-    assert "samples      begun: samples of factor 1: 60 of 60" in said("status", str(log.parent)).splitlines()
+    assert "samples        begun: samples of factor 1: 60 of 60" in said("status", str(log.parent)).splitlines()
 
 
 def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> None:
@@ -122,6 +122,9 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
     words = said(*run)
     assert "does not exist any more" in words
     assert "ingest: done before" in words
+    said(*run, "--data", "misspelt", code=1)
+    assert "misspelt: no such file or folder; check its name" in said.errors
+    assert "ingest: done before" in said(*run), "nothing was removed"
 
 
 def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
