@@ -55,7 +55,7 @@ def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) ->
     (place / "models" / "bars" / "1").mkdir(parents=True)
     (place / "models" / "bars" / "1" / "pose.obj").touch()
     for arguments, says in (
-        (("run", "bad.toml"), "export: Field required"),
+        (("run", "bad.toml"), "export: is not there; add it"),
         (("run", "none.toml"), "none.toml: can't be read: there is no such file or folder"),
         (("run", "meshes"), "meshes: can't be read: it is a folder"),
         (("run", "latin.toml"), "it is not text in UTF-8"),
