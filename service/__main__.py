@@ -48,6 +48,7 @@ def _serve(validator: BundleValidator) -> None:
     from pydantic import ValidationError
 
     from shapespace.bundle.finding import BUNDLED
+    from shapespace.refused_values import in_short
     from shapespace.service.repository.validation import bundle_folders
     from shapespace.service.settings import PREFIX, Settings, is_loopback, unknown_variables
 
@@ -55,8 +56,8 @@ def _serve(validator: BundleValidator) -> None:
         settings = Settings()
     except ValidationError as error:
         for fault in error.errors():
-            told = fault["msg"].removeprefix("Value error, ")
-            print(f"{PREFIX}{str(fault['loc'][0]).upper()}: {told}", file=sys.stderr)
+            name = f"{PREFIX}{str(fault['loc'][0]).upper()}"
+            print(*in_short([{**fault, "loc": (name,)}], {}), file=sys.stderr)
         raise SystemExit(2) from None
     with suppress(OSError):  # loading the models reports the reason
         validator.begin(bundle_folders(settings.models_dir)[0])
@@ -91,7 +92,7 @@ def _serve(validator: BundleValidator) -> None:
 COMMAND = Subcommand(
     "serve",
     serve,
-    help="Start the server: web page and HTTP interface for the models of a folder.",
+    help="Start the server: web page and HTTP interface.",
     epilog="Settings are environment variables. SHAPESPACE_HOST and SHAPESPACE_PORT set the address, and "
     "SHAPESPACE_MODELS_DIR the folder of models. docs/reference/settings.md lists all settings.",
     # All that is unknown together, so that the message names all of it.

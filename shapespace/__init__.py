@@ -61,6 +61,7 @@ An iteration that fails returns a value: look at ``status`` and ``reason`` of th
 operations of a model over HTTP.
 """
 
+import os
 from importlib import import_module
 from os.path import isfile
 from typing import TYPE_CHECKING
@@ -99,6 +100,10 @@ if TYPE_CHECKING:
     from shapespace.shell.transport import parallel_transport
     from shapespace.solve.deadline import Deadline
     from shapespace.solve.outcome import Status
+
+# From version 1.29 on, ONNX Runtime reports names and digests of models to its maker, unless this is set before its
+# import.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __version__ = "0.2.0"
 __all__ = [

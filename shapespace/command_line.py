@@ -55,7 +55,7 @@ class FileOrFolder(click.Path):
     """Path of the command line, which must not be empty, as after a misspelt variable of the shell."""
 
     def __init__(self) -> None:
-        super().__init__(path_type=Path)
+        super().__init__(path_type=Path, readable=False)  # reading it says more
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path; fail if it is empty."""

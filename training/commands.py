@@ -183,7 +183,7 @@ def status(run: Path) -> None:
         state = f"done in {stamp['seconds']:.0f} s" if "seconds" in stamp else begun if "key" in stamp else "to do"
         if faults := [f"{path.relative_to(directory.folder)} is {why}" for stage, path, why in lost if stage == name]:
             state = f"to do again: {listed(faults)}"
-        print(f"{name:12} {state}")
+        print(f"{name:{max(map(len, STAGES))}} {state}")
 
 
 @_command

@@ -22,6 +22,7 @@ from shapespace.model.latent_space import InvalidFixedError, NotFiniteError, Out
 from shapespace.model.networks import ModelFailedError, NetworkTimeError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.vertex_uncertainty import InvalidCovarianceError
+from shapespace.refused_values import WANTED
 from shapespace.service.http.problems import ProblemError, problem, shortened
 from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
 from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
@@ -145,22 +146,13 @@ def _place(fault: Mapping[str, Any]) -> tuple[str | int, ...]:
 #: Name of a type in the place of a fault.
 _TYPE = re.compile(r"[a-z-]+\[.*\]")
 #: How to correct a fault that pydantic found, by its type.
-_ADVICE = {
+_ADVICE = {kind: f"Send {wanted} for {{name}}." for kind, wanted in WANTED.items()} | {
     "extra_forbidden": "Remove {name!r}: there is no such field. /openapi.json lists all fields.",
     "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
-    "list_type": "Send a list for {name}.",
     "too_short": "Send {min_length} or more entries for {name}, not {actual_length}.",
     "too_long": "Send {max_length} or fewer entries for {name}, not {actual_length}.",
-    "greater_than": "Send a number above {gt:g} for {name}.",
-    "greater_than_equal": "Send a number of at least {ge:g} for {name}.",
-    "less_than_equal": "Send a number of at most {le} for {name}.",
-    "less_than": "Send a number below {lt} for {name}.",
     "value_error": "Correct {name}: {error}.",
-    **dict.fromkeys(("float_type", "float_parsing"), "Send a number for {name}."),
-    **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "Send a whole number for {name}."),
-    **dict.fromkeys(("bool_type", "bool_parsing"), "Send true or false for {name}."),
     **dict.fromkeys(("model_attributes_type", "model_type", "dict_type"), "Send a JSON object for {name}."),
-    **dict.fromkeys(("enum", "literal_error"), "Send {expected} for {name}."),
 }
 
 

@@ -23,13 +23,19 @@ from shapespace.service.http.connections import HEAD_BYTES, Connection
 from shapespace.service.logs import RateLimitedLog
 from shapespace.service.operation.metrics_port import MetricsPort
 from shapespace.service.repository.repository import ModelRepository
-from shapespace.service.settings import Settings
+from shapespace.service.settings import PREFIX, Settings
 
 logger = logging.getLogger(__name__)
 #: Exit status of a process that could not start, as in uvicorn.
 STARTUP_FAILURE = 3
 #: Errors of an address that the machine does not have, as `localhost` by IPv6 in a container without IPv6.
 _NO_SUCH_ADDRESS = frozenset({errno.EAFNOSUPPORT, errno.EADDRNOTAVAIL})
+#: What to do about a port that can't be used.
+_REMEDIES = {
+    errno.EADDRINUSE: "; another program has this port, so stop it or set {setting} to another port",
+    errno.EACCES: "; set {setting} to a port from 1024 on",
+    errno.EADDRNOTAVAIL: f"; set {PREFIX}HOST to an address of this machine",
+}
 _OUT_OF_HANDLES = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 #: Bytes of an answer that the kernel may buffer unsent; its default is megabytes.
 UNSENT_BYTES = 128 * 2**10
@@ -85,7 +91,10 @@ class Server(uvicorn.Server):
                 port = metrics_port
                 metrics = MetricsPort(host, port)
         except OSError as error:
-            logger.error("can't listen on %s, port %d: %s", host, port, error.strerror)
+            setting = "PORT" if port == self._settings.port else "METRICS_PORT"
+            why = os.strerror(error.errno) if error.errno in _REMEDIES else error.strerror
+            remedy = _REMEDIES.get(error.errno or 0, "").format(setting=f"{PREFIX}{setting}")
+            logger.error("can't listen on %s, port %d: %s%s", host, port, why, remedy)
             raise SystemExit(STARTUP_FAILURE) from None
         await super().startup(sockets=self._listeners)
         if metrics:
@@ -100,6 +109,12 @@ class Server(uvicorn.Server):
         print(f"shapespace is at {address}/", flush=True)
         if call := _first_call(address, self._app.state.service.repository, self._settings.api_key is not None):
             print(f"Your first shape, from another terminal: {call}", flush=True)
+        else:
+            logger.warning(
+                "no model is served: %s has no folder NAME/VERSION with a model; %sMODELS_DIR names another folder",
+                self._settings.models_dir,
+                PREFIX,
+            )
 
     def _hang_up(self) -> None:
         if self._terminal and not sys.stdin.isatty():  # the terminal was closed, which is no request to reload

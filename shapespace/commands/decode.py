@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from shapespace.command_line import FileOrFolder, fail, near
 from shapespace.commands.parameters import (
@@ -91,9 +92,8 @@ def decode(
         raise click.UsageError("choose --latent or --random", click.get_current_context())
     extension, is_folder = _kind_of(out, format)
     if not is_folder and (random or len(latent)) > 1:
-        raise UnusableOutputError(
-            f"{out} is one file; for several shapes, name a folder, such as {out.with_suffix('')}"
-        )
+        one, folder = ("standard output", "shapes") if out == STANDARD else (out, out.with_suffix(""))
+        raise UnusableOutputError(f"{one} is one file; for several shapes, name a folder, such as {folder}")
     loaded, choice_of_mesh = load(model), MeshChoice(mesh or MeshChoice.FINE)
     given = loaded.sample(random, seed, Distribution(distribution or Distribution.UNIFORM)) if random else latent
     codes, inside = loaded.latents.codes(given, Bounds(bounds or Bounds.ALLOW))
@@ -118,6 +118,11 @@ def decode(
             write(path, FORMATS[extension].encode(shape.vertices, faces, None, surface))
     if out != STANDARD:
         print(f"{near(out)}: {count} shapes and {CODES}" if table else near(out), file=sys.stderr)
+    clamped = loaded.latents.codes(given, Bounds.CLAMP)[0]
+    far = (np.abs(codes - clamped) > (loaded.upper - loaded.lower) / 2).any(axis=1)
+    if guesses := [path.name for path, each in zip(paths, far, strict=False) if each]:
+        named = ", ".join(guesses[:3]) + (", …" if len(guesses) > 3 else "")
+        print(f"{named}: the code lies far outside the bounds, so the shape is a guess", file=sys.stderr)
     if missed:
         return fail(
             f"the solver did not converge for {', '.join(missed[:3])}: look at these shapes before you use them"

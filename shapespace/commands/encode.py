@@ -40,6 +40,8 @@ def encode(model: str, files: Sequence[Path], table: Path, force: bool, **parame
     require_new([table], force=force)
     loaded, options, refused = load(model), chosen(EncodeOptions, parameters), 0
     loaded.latents.fixed(options.fixed)
+    if table != STANDARD:
+        table.parent.mkdir(parents=True, exist_ok=True)
     bar = click.progressbar(files, label="meshes", file=sys.stderr, hidden=not sys.stderr.isatty())
     with nullcontext(sys.stdout) if table == STANDARD else table.open("w", encoding="utf-8", newline="") as file, bar:
         writer = csv.writer(file, lineterminator="\n")

@@ -26,6 +26,7 @@ from shapespace.model.latent_space import LatentError
 from shapespace.model.networks import ModelFailedError
 from shapespace.model.options import descriptions
 from shapespace.model.scan import InvalidScanError
+from shapespace.refused_values import in_short
 
 K = TypeVar("K")
 
@@ -65,9 +66,7 @@ class _JsonType(click.ParamType):
         try:
             return self._adapter.validate_json(value)
         except ValidationError as error:
-            fault = error.errors(include_url=False, include_input=False)[0]
-            place = ".".join(map(str, fault["loc"]))
-            self.fail(f"{place + ': ' if place else ''}{fault['msg']}", param, ctx)
+            self.fail(in_short(error.errors(include_url=False, include_input=False), {})[0], param, ctx)
 
 
 MODEL = click.Argument(["model"], type=_ModelType(), metavar="MODEL")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -27,13 +27,20 @@ def synced_file(path: Path) -> Iterator[IO[bytes]]:
 def replaced_file(path: Path) -> Iterator[IO[bytes]]:
     """Open a file that takes the place of ``path`` when the block ends without an error.
 
-    Missing folders are created.
+    Missing folders are created. Until then the content is in a hidden file beside it, which errors don't name.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    with synced_file(part) as file:
-        yield file
-    os.replace(part, path)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with synced_file(part) as file:
+            yield file
+        os.replace(part, path)
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename == os.fspath(part):
+            error.filename = os.fspath(path)
+        with suppress(OSError):
+            part.unlink()
+        raise
 
 
 @contextmanager

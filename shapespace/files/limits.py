@@ -73,8 +73,10 @@ def clipped(text: object, most: int = 100) -> str:
 
 def read_plain(path: Path) -> bytes:
     """Return the content of a file; raises OSError, also for a device or a pipe, which might never end."""
+    if path.name == str(path) == "-" and not path.exists():
+        raise OSError(errno.EINVAL, "standard input is not read; save its content in a file first", str(path))
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise OSError(errno.EINVAL, "it is a device or a pipe, where a file is needed", str(path))
+        raise OSError(errno.EINVAL, "it is a device or a pipe; save its content in a file first", str(path))
     return path.read_bytes()
 
 

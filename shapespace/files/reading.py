@@ -13,7 +13,7 @@ import numpy as np
 
 from shapespace.files.archives import Place
 from shapespace.files.gltf_reading import MorphShapes, read_gltf, read_morph_shapes
-from shapespace.files.limits import UNLIMITED, Limits, reason
+from shapespace.files.limits import UNLIMITED, Limits, in_words, read_plain, reason
 from shapespace.files.npz import read_mesh_npz
 from shapespace.files.pcd_reading import read_pcd
 from shapespace.files.ply_reading import read_ply
@@ -109,12 +109,11 @@ def read_morph_file(path: Path) -> MorphShapes:
 
 
 def _content(path: Path) -> bytes:
-    if path.exists() and not path.is_file():
-        raise MeshError("can't be read: it is not a file")
     try:
-        return path.read_bytes()
+        return read_plain(path)
     except OSError as error:
-        raise MeshError(f"can't be read: {error.strerror}") from error
+        hint = "; name the files in it, as in *.ply" if path.is_dir() else ""
+        raise MeshError(f"can't be read: {in_words(error, named=False)}{hint}") from error
 
 
 @contextmanager

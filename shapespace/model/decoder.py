@@ -70,7 +70,7 @@ class Decoder:
         self.modes, self.file_vertices = bundle.modes, bundle.file_vertices
         self._surface = bundle.surface
         self._nearer = (
-            f'Choose a code nearer to the bounds, which the card of {manifest.name} lists, or send "bounds": "clamp".'
+            f"Choose a code nearer to the bounds, which the card of {manifest.name} lists, or set bounds to clamp."
         )
         self._overflow = f"The code lies so far outside the bounds that the model's numbers overflow. {self._nearer}"
         #: Tolerance of the quality ``auto``, and its measured error; None if ``auto`` answers full shapes.

@@ -67,6 +67,8 @@ def require_targets(decoder: Decoder, targets: Sequence[Target], mesh: MeshChoic
             raise InvalidTargetError(
                 f"targets[{i}].vertex is {target.vertex}, but the {mesh} mesh has vertices 0 to {count - 1}."
             )
+        if np.shape(target.position) != (3,):
+            raise InvalidTargetError(f"targets[{i}].position has another shape than (3,). Send x, y and z.")
         if target.sigma is not None and not 0 < target.sigma < np.inf:
             raise InvalidTargetError(f"targets[{i}].sigma is {target.sigma:g}. Send a number above 0, or leave it out.")
 

@@ -111,7 +111,7 @@ class LatentSpace:
         """
         for i, value in enumerate(values):
             if len(value) != self.dimension:
-                names = f" ({', '.join(self.names)})" if self.dimension <= 12 else ""
+                names = f" ({'; '.join(self.names)})" if self.dimension <= 12 else ""
                 raise WrongLengthError(
                     f"Code {i} has {len(value)} numbers, but {self.model} takes {self.dimension}{names}. "
                     f"Send exactly {self.dimension}."

@@ -135,5 +135,10 @@ class ShapeLayer(nn.Module):
         """Return positions (n, V, 3) of codes (n, m)."""
         if codes.ndim != 2 or codes.shape[1] != len(self.names):
             raise ValueError(f"codes must be (n, {len(self.names)}), not {tuple(codes.shape)}")
+        if codes.dtype != self.lower.dtype:
+            raise TypeError(
+                f"codes are {codes.dtype}, but the layer computes in {self.lower.dtype}: convert the codes by "
+                "codes.to(layer.lower.dtype), or the layer by layer.double() or layer.float()"
+            )
         positions: Tensor = self.decoded(codes)[0]
         return positions

@@ -149,10 +149,12 @@ def write(
 
     Raises:
         IngestError: the collection can't be used.
-        ConfigError: the file exists and ``force`` isn't set, or the file can't be written.
+        ConfigError: the meshes are a configuration, the file exists and ``force`` isn't set, or it can't be written.
     """
     full = meshes.resolve()
     title = (full.stem if full.is_file() else full.name) or "shapes"
+    if full.is_file() and full.suffix == ".toml":
+        raise ConfigError(f"{meshes}: is a configuration, from which run trains; init needs a folder of meshes")
     out = out or Path(f"{title}.toml")
     if out.exists() and not force:
         raise ConfigError(f"{out}: exists already; --force replaces it, --out FILE.toml writes another file")

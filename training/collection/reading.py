@@ -247,8 +247,8 @@ def _on_shared_vertices(corners: FloatArray, faces: IntArray, vertex_count: int,
 def _read_npz(path: Path) -> FileShapes:
     if extension(path) != "npz":
         what = (
-            "is one mesh; a single file can hold a collection only as .npz, or as .glb or .gltf with a morph "
-            "target for each shape"
+            f"is {'one mesh' if extension(path) in READ_FORMATS else 'no mesh'}; a single file can hold a collection "
+            "only as .npz, or as .glb or .gltf with a morph target for each shape"
         )
         raise IngestError(Fault(str(path), what, "name the folder that holds the meshes"))
     with refusing(ShapeSource.of_file(path)):

@@ -159,7 +159,12 @@ def export(
     except ValidationError as error:
         fault = error.errors(include_url=False, include_input=False)[0]
         raise ExportError(f"the manifest's {'.'.join(map(str, fault['loc']))}: {fault['msg']}") from None
-    except (BundleError, ModelFailedError, NotFiniteError) as error:
+    except NotFiniteError as error:
+        raise ExportError(
+            "a random code inside the bounds has no shape, so the model is too poor to be used. What may help: more "
+            "samples.count, a larger collection.coarse_vertices, or leave out the shapes farthest from the others"
+        ) from error
+    except (BundleError, ModelFailedError) as error:
         raise ExportError(f"the bundle can't be served: {error}") from None
 
 

@@ -17,6 +17,8 @@ STILL_FALLS = 0.15
 NETWORKS = 0.3
 #: More shapes are advised if training shapes have at most this share of the unseen error.
 LEARNED = 0.6
+#: Below this mean error on unseen shapes, as a share of the diagonal, nothing is advised.
+NEGLIGIBLE = 1e-4
 #: Without comparisons, a model is good up to this mean vertex error, as a share of the diagonal.
 GOOD = 0.005
 
@@ -44,7 +46,7 @@ def verdict(record: Record) -> str:
 def advice(record: Record) -> Iterator[str]:
     """Yield sentences on what to change, the most useful first."""
     unseen, facts = _unseen(record), record.generalisation
-    if not unseen:
+    if not unseen or unseen["modes"] < NEGLIGIBLE:
         return
     count, own, rival = facts["counts"][-1], unseen["modes"], _strongest(unseen)
     compared = record.geometry.get("errors")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from difflib import get_close_matches
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import tomlkit
 from pydantic import Field, ValidationError, model_validator
 
 from shapespace.files.limits import in_words, read_plain
+from shapespace.refused_values import UNKNOWN, in_short
 from shapespace.shell.energy import Material
 from shapespace.training.runs.network_settings import FitSettings, LatentNetworkSettings, NetworkSettings
 from shapespace.training.runs.settings import (
@@ -27,6 +29,13 @@ from shapespace.training.runs.settings import (
 
 #: Settings of version 0.2 that a run reads and ignores.
 IGNORED = ("networks.fractions", "networks.seeds", "variants")
+
+
+#: Sentences about faults, by pydantic's types.
+_WORDS = {
+    UNKNOWN: "there is no such setting here; remove it or correct its spelling",
+    "string_pattern_mismatch": "needs small letters, digits and hyphens only, as in my-model",
+}
 
 
 class ConfigError(ValueError):
@@ -83,10 +92,21 @@ def parse(text: str, source: str) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        words = {"extra_forbidden": "there is no such setting here; remove it or correct its spelling"}
-        faults = [(".".join(map(str, e["loc"])), words.get(e["type"], e["msg"])) for e in error.errors()]
-        lines = [f"{source}: these settings can't be used", *(": ".join(filter(None, fault)) for fault in faults)]
+        faults = [_with_spelling(fault) for fault in error.errors()]
+        lines = [f"{source}: these settings can't be used", *in_short(faults, _WORDS)]
         raise ConfigError("\n  ".join(lines)) from error
+
+
+def _with_spelling(fault: Any) -> dict[str, Any]:
+    """Return a fault, with the setting that an unknown name most resembles."""
+    if fault["type"] != UNKNOWN:
+        return fault
+    *way, name = fault["loc"]
+    table: Any = Config
+    for part in way:
+        table = getattr(getattr(table, "model_fields", {}).get(part), "annotation", None)
+    near = get_close_matches(str(name), getattr(table, "model_fields", ()), 1)
+    return fault | ({"words": f"there is no such setting here; did you mean {near[0]}?"} if near else {})
 
 
 def load(path: Path, data: Path | None = None, stored: Path | None = None) -> tuple[Config, str]:

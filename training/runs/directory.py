@@ -71,8 +71,9 @@ class RunDirectory:
             raise NotARunError(
                 f"{self.folder} is no folder, and a run's results lie in one: name an empty or a new folder with --out"
             )
-        # A run that was killed at its begin has left the folder of stamps and no configuration.
-        if self.folder.exists() and not self.was_begun() and {path.name for path in self.folder.iterdir()} - {"stages"}:
+        # A run that was killed at its begin has left the folder of stamps and no whole configuration.
+        own = {"stages", f".{self.config.path.name}.part"}
+        if self.folder.exists() and not self.was_begun() and {path.name for path in self.folder.iterdir()} - own:
             raise NotARunError(
                 f"{self.folder} holds other files and is not a run directory, so nothing was written there; name an "
                 "empty or a new folder with --out"

@@ -15,7 +15,7 @@ from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count, pga
 from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.space.straight_lines import StraightLines
-from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning, listed
+from shapespace.training.stages.stage import Run, Stage, StageWarning, against_failures, listed
 
 
 def decompose(run: Run) -> None:
@@ -84,7 +84,7 @@ def _straighten(run: Run) -> None:
         "sparsity": 0.0,
         "pga_explained": explained,
         "linearised_logarithms": 0,
-        "asked": chosen["count"],
+        "asked": chosen["count"] if run.config.modes.count == "auto" else run.config.modes.count,
         "log_steps": 1,
         "steps": [1] * len(shapes),
     }
@@ -121,7 +121,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
             f"for {len(linearised)} of {len(steps)} shapes no geodesic was found, so a straight line replaces "
             f"it: {listed(linearised)}"
         )
-        warnings.append(StageWarning(sentence, len(linearised) / len(steps), COARSER_MESH))
+        warnings.append(StageWarning(sentence, len(linearised) / len(steps), against_failures(run)))
     finer = names[steps > facts["log_steps"]].tolist()
     if finer:
         sentence = f"{len(finer)} of {len(steps)} logarithms needed more time steps: {listed(finer)}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from shapespace.bundle.writer import require_replaceable
+from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import Config
@@ -139,6 +140,8 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
         # before hours of work
         materials = directory.surface_names.read_if_written().get("materials", ())
         require_replaceable(run.bundle, [material["texture"] for material in materials])
+        if sentence := replaces_another(run):
+            show(sentence)
     if until is None or order.index(until) >= order.index("networks"):
         # First: loaded after the libraries that solve other stages' equations, its results differ in the last bits.
         import_module("torch")
@@ -164,6 +167,18 @@ def _execute(run: Run, until: str | None, *, keep_going: bool, command: str, sho
     return done
 
 
+def replaces_another(run: Run) -> str:
+    """Return a sentence if the run will replace a bundle that it has not written; empty otherwise."""
+    own = f"{run.bundle.parent.name}/{run.bundle.name}"
+    written = any(event.get("event") == "exported" and event.get("bundle") == own for event in run.directory.events())
+    if written or not run.bundle.exists():
+        return ""
+    return (
+        f"{run.bundle} exists, and this run has not written it. The stage export will replace it. To keep it, set "
+        "another name or version under [export] in the configuration"
+    )
+
+
 def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
     """Remove outdated results and write the configuration. Return the keys of the stages, and facts about the data."""
     directory, source = run.directory, run.config.collection.data
@@ -172,8 +187,7 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
     data, known = _data_facts(run), directory.data.read_if_written()
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)
-    if source and known and not source.exists():
-        show(f"data: {source} does not exist any more; the run continues with the results of ingest")
+    if gone := bool(source and known and not source.exists()):
         data = known
     elif known and (changes := _changes(known, data)):
         show(f"data: {changes}; all stages from ingest on run again")
@@ -183,6 +197,11 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
             "benchmarks.studies in the repository"
         )
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
+    if gone:
+        if directory.stamp("ingest").read_if_written().get("key") != keys["ingest"]["key"]:
+            # Before results are removed.
+            raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
+        show(f"data: {source} does not exist any more; the run continues with the results of ingest")
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data

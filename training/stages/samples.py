@@ -14,7 +14,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.latent_coordinates import alone
 from shapespace.training.runs.sampling import DERIVATIVES, DONE, KNOWN, columns, indices, parts, split, used
 from shapespace.training.space.generalisation import RANDOM
-from shapespace.training.stages.stage import COARSER_MESH, Run, Stage, StageWarning
+from shapespace.training.stages.stage import Run, Stage, StageWarning, against_failures
 
 #: Most samples of a straight-line model.
 STRAIGHT_SAMPLES = RANDOM
@@ -55,7 +55,8 @@ def draw_samples(run: Run) -> None:
 
 def _warnings(run: RunDirectory) -> list[StageWarning]:
     grouping = run.factors.read_if_written()
-    advice = f"{COARSER_MESH}; or leave out the shapes farthest from the others, which make the range of codes large"
+    others = "leave out the shapes farthest from the others, which make the range of codes large"
+    advice = f"{against_failures(run)}; or {others}"
     warnings = []
     kinds = {"joint": run.samples}
     kinds |= {f"{name!r}": run.factor_samples(j) for j, name in enumerate(grouping.get("names", ()))}

@@ -28,11 +28,6 @@ TOLERATED_LOSS = 0.25
 SMALLER = 10
 #: Most names in a sentence.
 LISTED_NAMES = 6
-#: What helps where logarithms or samples fail.
-COARSER_MESH = (
-    "a larger collection.coarse_vertices or material.eta, because the usual cause is a thin or folded part of the "
-    "coarse mesh"
-)
 
 
 @dataclass(frozen=True)
@@ -182,3 +177,9 @@ class Stage:
             return hashlib.sha256(json.dumps([self.name, self.version, read, before]).encode()).hexdigest()
 
         return {"key": digest(settings), "basis": digest(rest)}
+
+
+def against_failures(run: RunDirectory) -> str:
+    """Return what helps if logarithms or samples fail. More vertices help only if the meshes were simplified."""
+    setting, mesh = ("collection.coarse_vertices or ", "coarse mesh") if run.prolongation.exists() else ("", "mesh")
+    return f"a larger {setting}material.eta, because the usual cause is a thin or folded part of the {mesh}"

@@ -103,8 +103,15 @@ def test_a_metrics_port_that_is_taken_stops_the_start(small_models: Path) -> Non
             check=False,
         )
     assert ended.returncode == STARTUP_FAILURE
-    assert f"can't listen on 127.0.0.1, port {port}: Address already in use" in ended.stderr
+    assert f"can't listen on 127.0.0.1, port {port}: Address already in use; another program" in ended.stderr
+    assert "set SHAPESPACE_METRICS_PORT to another port" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_a_folder_without_models_is_told(tmp_path: Path) -> None:
+    with starting() as start:
+        log = start(tmp_path).stop()
+    assert f"no model is served: {tmp_path} has no folder NAME/VERSION with a model; SHAPESPACE_MODELS_DIR" in log
 
 
 def test_spans_follow_the_callers_trace_and_name_the_stages(small_models: Path) -> None:

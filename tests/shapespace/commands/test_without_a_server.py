@@ -121,6 +121,9 @@ def test_several_codes_can_be_named_and_one_goes_to_standard_output(
     assert shell.err == ""
     shell("decode", "small", "--out", tmp_path / "reference.ply")
     np.testing.assert_allclose(read_arrays(tmp_path / "reference.ply")[0], model.vertices, atol=1e-6)
+    for code, note in (("0,0,1.3", False), ("0,0,1.9", True)):
+        shell("decode", "small", "--latent", code, "--out", tmp_path / "far.obj", "--force")
+        assert ("far.obj: the code lies far outside the bounds" in shell.err) is note
 
 
 def test_meshes_become_a_table_and_a_bad_one_stops_nothing(shell: Shell, model: ShapeModel, tmp_path: Path) -> None:
@@ -139,7 +142,7 @@ def test_meshes_become_a_table_and_a_bad_one_stops_nothing(shell: Shell, model: 
     assert "3 vertices" in odd["reason"]
     assert "can't be read" in none["reason"]
     assert poor["status"] == "poor"
-    out = tmp_path / "codes.csv"
+    out = tmp_path / "new" / "codes.csv"  # folders are made
     assert shell("encode", "small", files[0], "--csv", out) == ""
     shell("encode", "small", files[0], "--csv", out, code=1)
     assert "codes.csv: exists already" in shell.err
@@ -183,6 +186,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("decode smaller --out x.glb", 1, "no model smaller here: choose among figure, freaky-torus, small, or name"),
         ("decode none/small --out x.glb", 1, "none/small can't be read: there is no such file or folder"),
         ("decode small --random 2 --out x.glb", 1, "x.glb is one file; for several shapes, name a folder, such as x"),
+        ("decode small --random 2 --out -", 1, "standard output is one file; for several shapes, name a folder"),
         ("decode small --out x.xyz", 1, "there is no format 'xyz'; choose among glb, gltf, obj"),
         ("decode small --out models/small/1/README.md", 1, "there is no format 'md'"),
         ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
@@ -190,7 +194,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("page small --out plain", 1, "plain is a file; name a folder"),
         ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
         ("fit small a.ply --json plain", 1, "plain: exists already"),
-        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3"),
+        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3 ("),
         ("decode small --latent 9,0,0 --bounds reject --out x.glb", 1, "Move it inside"),
         ("decode small --latent 1,x,2 --out x.glb", 2, "is not a list of numbers"),
         ("decode small --latent 1,2,3 --random 2 --out x", 2, "choose --latent or --random"),
@@ -200,11 +204,15 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("decode small --unknown --out x.glb", 2, "No such option"),
         ("encode small", 2, "Missing argument"),
         ("encode small a.ply --fixed {", 2, "--fixed"),
+        ("encode small a.ply --fixed {\"x\":0}", 2, "'--fixed': the key x: needs a whole number."),
         ("encode small a.ply --samples 3", 2, "No such option"),
         ("encode small a.ply --fixed {\"7\":0}", 1, "fixed names coordinate 7"),
         ("fit small none.ply", 1, "none.ply: can't be read"),
+        ("fit small models", 1, "models: can't be read: it is a folder, but a file is needed; name the files in it"),
+        ("fit small -", 1, "-: can't be read: standard input is not read; save its content in a file first"),
+        ("fit small /dev/null", 1, "/dev/null: can't be read: it is a device or a pipe; save its content in a file"),
         ("fit small none.ply --noise 0", 2, "--noise"),
-        ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "position"),
+        ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "0.position: is not there; add it"),
         ("fit small none.ply --out", 2, "requires an argument"),
         ("fit small a.ply b.ply", 2, "unexpected extra argument"),
         ("models small", 2, "unexpected extra argument"),

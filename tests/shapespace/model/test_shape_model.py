@@ -234,6 +234,8 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
     for vertex in (-1, count):
         with pytest.raises(InvalidTargetError, match=f"vertex is {vertex}, but the coarse mesh"):
             model.edit(CODES[0], {vertex: [0, 0, 0]}, mesh="coarse")
+    with pytest.raises(InvalidTargetError, match=r"targets\[0\]\.position has another shape"):
+        model.edit(CODES[0], {0: [1, 2]})
     with pytest.raises(NotFiniteError):
         model.edit(CODES[0], {0: [np.inf, 0, 0]})
 

@@ -68,3 +68,8 @@ def test_layer_moves_between_processes_and_types(tiny: Path) -> None:
 def test_layer_refuses_codes_of_another_length(tiny: Path) -> None:
     with pytest.raises(ValueError, match=r"codes must be \(n, 3\), not \(2, 5\)"):
         ShapeLayer(tiny)(torch.zeros(2, 5))
+
+
+def test_layer_refuses_codes_of_another_type_and_says_how_to_convert_them(tiny: Path) -> None:
+    with pytest.raises(TypeError, match=r"float64, but the layer computes in torch\.float32.*layer\.double"):
+        ShapeLayer(tiny)(torch.zeros(2, 3, dtype=torch.float64))

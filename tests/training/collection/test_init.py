@@ -122,6 +122,11 @@ def test_nothing_is_replaced_unless_asked_for(tmp_path: Path) -> None:
     assert out.read_text() == "mine"
     write(folder, out, force=True)
     assert load(out)[0].export.name == "meshes"
+    with pytest.raises(ConfigError, match=r"here\.toml: is a configuration, from which run trains"):
+        write(out, force=True)
+    (tmp_path / "notes.md").write_text("mine")
+    with pytest.raises(IngestError, match=r"notes\.md: is no mesh; a single file"):
+        write(tmp_path / "notes.md")
     with pytest.raises(ConfigError, match="can't be written"):
         write(folder, tmp_path / "none" / "here.toml")
 

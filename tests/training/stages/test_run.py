@@ -3,13 +3,14 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shapespace.training import stages
 from shapespace.training.runs.config import load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.stages.run import STAGES, execute, stage_keys
-from shapespace.training.stages.stage import Run
+from shapespace.training.stages.stage import Run, against_failures
 from tests.training.conftest import TINY
 
 HERE, RUNS = Path(__file__).parent, Path(__file__).parents[3] / "runs"
@@ -74,3 +75,10 @@ def test_the_time_of_a_stage_adds_up_over_calls(tmp_path: Path) -> None:
     assert (run.spent("samples", "a"), run.spent("samples", "b"), run.spent("mean", "a")) == (25, 30, 0)
     run.log("end", stage="samples")
     assert run.spent("samples", "a") == 0
+
+
+def test_more_vertices_are_advised_only_where_the_mesh_was_simplified(tmp_path: Path) -> None:
+    directory = RunDirectory(tmp_path)
+    assert against_failures(directory).startswith("a larger material.eta")
+    directory.prolongation.write(vertices=np.zeros(1))
+    assert against_failures(directory).startswith("a larger collection.coarse_vertices or material.eta")

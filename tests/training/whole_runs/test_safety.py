@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 
 from shapespace.training.runs.atomic_files import DamagedFileError, JsonFile, NpzFile
+from shapespace.training.runs.config import load
 from shapespace.training.runs.directory import NotARunError, RunDirectory
+from shapespace.training.stages.run import replaces_another
+from shapespace.training.stages.stage import Run
 from tests.training.conftest import TINY, Said, command, train
 
 MINE = """
@@ -36,6 +39,16 @@ def config(tmp_path: Path) -> Path:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_says_beforehand_that_it_replaces_the_bundle_of_another_run(config: Path, tmp_path: Path) -> None:
+    run = Run(tmp_path / "run", *load(config), tmp_path / "models")
+    run.directory.begin()
+    assert replaces_another(run) == ""
+    run.bundle.mkdir(parents=True)
+    assert "tiny-torus/1 exists, and this run has not written it" in replaces_another(run)
+    run.directory.log("exported", bundle="tiny-torus/1")
+    assert replaces_another(run) == ""
 
 
 @pytest.mark.parametrize("name", FOREIGN)

@@ -21,7 +21,7 @@ mirror = false
 
 [modes]
 geometry = "{geometry}"
-count = 2
+count = {count}
 
 [evaluation]
 reconstructions = 2
@@ -45,7 +45,7 @@ def test_a_straight_line_model_is_served_without_training(
     np.savez(data, vertices=shapes, faces=mesh.faces)
     decoder = not examples  # one of both, because PyTorch takes long to export it
     flags = {name: str(flag).lower() for name, flag in (("examples", examples), ("decoder", decoder))}
-    text = CONFIG.format(data=json.dumps(str(data)), geometry=geometry, **flags)
+    text = CONFIG.format(data=json.dumps(str(data)), geometry=geometry, count=2, **flags)
     run = Run(tmp_path / "run", parse(text, "straight.toml"), text, tmp_path / "models")
     said: list[str] = []
     assert execute(run, show=said.append)
@@ -81,6 +81,17 @@ def test_a_straight_line_model_is_served_without_training(
     report = _report(run)
     assert "Codes make shapes by straight lines of " in report
     assert "PCA with memory" in report
+
+
+def test_a_run_says_that_there_are_fewer_modes_than_asked_for(
+    blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path
+) -> None:
+    data = tmp_path / "shapes.npz"
+    np.savez(data, vertices=blends[1], faces=blends[0].faces)
+    text = CONFIG.format(data=json.dumps(str(data)), geometry="vertices", count=99, examples="false", decoder="false")
+    said: list[str] = []
+    execute(Run(tmp_path / "run", parse(text, "straight.toml"), text, tmp_path / "models"), "modes", show=said.append)
+    assert any("of 99 modes, because" in sentence for sentence in said)
 
 
 def _report(run: Run) -> str:

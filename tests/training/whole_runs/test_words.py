@@ -17,10 +17,13 @@ import numpy as np
 import pytest
 
 from shapespace.files.formats import MESH_FORMATS
+from shapespace.model.decoder import Decoder
 from shapespace.training.commands import HOME
+from shapespace.training.learning import ExportError
 from shapespace.training.report.page import page
 from shapespace.training.report.record import Record
 from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.stages.export import write_bundle_of
 from shapespace.training.stages.results import remember
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
@@ -52,7 +55,7 @@ def test_faults_of_the_user_s_making_are_one_message(place: Path, said: Said) ->
     (place / "models" / "bars" / "1").mkdir(parents=True)
     (place / "models" / "bars" / "1" / "pose.obj").touch()
     for arguments, says in (
-        (("run", "bad.toml"), "export: Field required"),
+        (("run", "bad.toml"), "export: is not there; add it"),
         (("run", "none.toml"), "none.toml: can't be read: there is no such file or folder"),
         (("run", "meshes"), "meshes: can't be read: it is a folder"),
         (("run", "latin.toml"), "it is not text in UTF-8"),
@@ -83,7 +86,7 @@ def test_status_of_a_stage_at_work_tells_its_samples(copy: Run, said: Said) -> N
     lines = log.read_text().splitlines()
     at = max(k for k, line in enumerate(lines) if '"samples of factor 1"' in line)
     log.write_text("\n".join(lines[: at + 1]))
-    assert "samples      begun: samples of factor 1: 60 of 60" in said("status", str(log.parent)).splitlines()
+    assert "samples        begun: samples of factor 1: 60 of 60" in said("status", str(log.parent)).splitlines()
 
 
 def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> None:
@@ -119,6 +122,9 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
     words = said(*run)
     assert "does not exist any more" in words
     assert "ingest: done before" in words
+    said(*run, "--data", "misspelt", code=1)
+    assert "misspelt: no such file or folder; check its name" in said.errors
+    assert "ingest: done before" in said(*run), "nothing was removed"
 
 
 def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
@@ -357,3 +363,16 @@ def test_the_next_command_works_from_where_one_stands(
     assert (name, Path(value).resolve()) == ("SHAPESPACE_MODELS_DIR", (tmp_path / "run" / "models").resolve())
     assert words_of[0] == "make"
     subprocess.run([*words_of, "--dry-run"], check=True, capture_output=True, env={**os.environ, name: value})
+
+
+def test_a_model_without_shapes_inside_its_bounds_is_refused_in_words_of_training(
+    copy: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(decoder: Decoder) -> None:
+        decoder.shape(np.full(decoder.latents.dimension, 1e30, np.float32))
+
+    monkeypatch.setattr("shapespace.training.learning.export.measure_accuracy", measure)
+    with pytest.raises(
+        ExportError, match=r"has no shape, so the model is too poor.*What may help: more samples\.count"
+    ):
+        write_bundle_of(copy, {})
