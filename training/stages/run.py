@@ -28,7 +28,7 @@ from shapespace.training.stages import (  # fmt: skip
     samples,
 )
 from shapespace.training.stages.results import LostFile, bundle_fault, file_facts, lost_files, written
-from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
+from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning, read_meshes
 
 _MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
 STAGES: dict[str, Stage] = {name: module.STAGE for name, module in zip(STAGE_NAMES, _MODULES, strict=True)}
@@ -197,11 +197,14 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
             "benchmarks.studies in the repository"
         )
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
-    if gone:
-        if directory.stamp("ingest").read_if_written().get("key") != keys["ingest"]["key"]:
-            # Before results are removed.
-            raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
+    stamp = directory.stamp("ingest").read_if_written()
+    changed = stamp.get("key") != keys["ingest"]["key"]
+    if gone and not changed:
         show(f"data: {source} does not exist any more; the run continues with the results of ingest")
+    elif gone:
+        raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
+    elif source and changed and "seconds" in stamp:
+        read_meshes(run.config).require_accepted(run.accepted)  # raises its errors before results are removed
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data

@@ -115,6 +115,11 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
     write(meshes / "bar9.obj", SHAPES[2])
     read("2 changed (bar2.obj, bar9.obj)")
     assert abs((meshes / "bar2.obj").stat().st_size - size) < 2000
+    (meshes / "bar5.obj").write_text("v 0 0 0")
+    said(*run, code=1)
+    assert "bar5.obj" in said.errors
+    (meshes / "bar5.obj").unlink()
+    read(None)  # the earlier results are still there
     (meshes / "bar4.obj").unlink()
     (meshes / "notes.txt").write_text("no mesh")
     read("1 removed (bar4.obj)")
