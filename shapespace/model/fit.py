@@ -119,9 +119,12 @@ class _Fit:
             self._reach(REFINED)
             self.ended = self._late
             ratio = None
+            doubt = Doubt.about(full, final, self.decoder)
+            if doubt and not self._late:
+                final, doubt = doubt.tested(middle, full, final, self.decoder)
+                self.ended = self._late
             posterior = posterior_of(full, final)
             explained, seen = full.shares(final)
-            doubt = Doubt.about(full, final, self.decoder.manifest.factors, self.decoder.reference.diagonal)
             if self._is_poor(explained, seen) and not self._late:
                 flip = np.array([-1, 1, 1])
                 scan = replace(self.scan, points=self.scan.points * flip, normals=self.scan.normals * flip)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.schema import FactorEntry
+from shapespace.model.decoder import Decoder
 from shapespace.model.fit_result import FitState
 from shapespace.model.fit_search import FitSearch
 from shapespace.model.fit_settings import SETTINGS
@@ -38,10 +39,10 @@ class Doubt:
     """
 
     away: float  # mean standard deviation of the surface, as a fraction of the diagonal
-    names: tuple[str, ...]  # factors that cause most of it
+    causes: list[FactorEntry]  # factors that cause most of it, the main one first
 
     @classmethod
-    def about(cls, search: FitSearch, state: FitState, factors: list[FactorEntry], diagonal: float) -> Doubt | None:
+    def about(cls, search: FitSearch, state: FitState, decoder: Decoder) -> Doubt | None:
         """Return the doubt about a fit, or None if its surface is certain."""
         movable = search.constraints.movable
         try:
@@ -56,15 +57,29 @@ class Doubt:
         shown[movable] = (areas * near) @ moved >= SETTINGS.shown * squares[movable]
         posterior = posterior_of(search, state, shown)
         spread = np.sqrt(((fields @ posterior.root[movable]) ** 2).sum(axis=(1, 2)))
-        away = float(areas @ spread / areas.sum() / diagonal)
+        away = float(areas @ spread / areas.sum() / decoder.reference.diagonal)
         if away <= SETTINGS.certain:
             return None
-        return cls(away, _causes(squares * posterior.covariance.diagonal(), factors))
+        return cls(away, _causes(squares * posterior.covariance.diagonal(), decoder.manifest.factors))
+
+    def tested(
+        self, middle: FitSearch, full: FitSearch, state: FitState, decoder: Decoder
+    ) -> tuple[FitState, Doubt | None]:
+        """Return the better of a fit and of one that begins with the causes at the prior's mean, and the doubt left."""
+        code, constraints = state.code.copy(), full.constraints
+        for factor in self.causes:
+            code[factor.start : factor.stop] = constraints.prior.mean[factor.start : factor.stop]
+        begun = middle.start(np.where(constraints.movable, code, state.code), state.placement, state.shape)
+        if begun is None:
+            return state, self
+        found = middle.run(begun, SETTINGS.middle_steps, first=True)
+        found = full.run(found, SETTINGS.last_steps, first=False)
+        return (found, Doubt.about(full, found, decoder)) if found.cost < state.cost else (state, self)
 
     @property
     def words(self) -> str:
         """What is doubtful and what to do."""
-        *most, last = self.names
+        *most, last = (factor.name for factor in self.causes)
         names = f"{', '.join(most)} and {last}" if most else last
         return (
             f"the scan says little about {names}: another shape, {self.away:.1%} of the diagonal away on average, may "
@@ -72,8 +87,8 @@ class Doubt:
         )
 
 
-def _causes(variances: FloatArray, factors: list[FactorEntry]) -> tuple[str, ...]:
-    """Return the names of the factors whose coordinates have the largest variances (m,), the largest first."""
-    parts = {factor.name: float(np.sqrt(variances[factor.start : factor.stop].sum())) for factor in factors}
-    most = sorted(parts, key=parts.__getitem__, reverse=True)
-    return tuple(name for name in most[:NAMED] if parts[name] >= COMPARABLE * parts[most[0]])
+def _causes(variances: FloatArray, factors: list[FactorEntry]) -> list[FactorEntry]:
+    """Return the factors whose coordinates have the largest variances (m,), the largest first."""
+    deviations = np.sqrt([variances[factor.start : factor.stop].sum() for factor in factors])
+    most = np.argsort(-deviations)[:NAMED]
+    return [factors[k] for k in most if deviations[k] >= COMPARABLE * deviations.max()]
