@@ -68,7 +68,7 @@ class ScanFitSettings:
     elsewhere: float = 0.01
     nearly: float = 1.1
     beside: float = 3e-3
-    shown: float = 1 / 3
+    shown: float = 0.4
     certain: float = 5e-3
     mirrored: float = 0.6
     rivals: int = 2

@@ -34,8 +34,8 @@ def posterior_of(search: FitSearch, state: FitState, shown: NDArray[np.bool_] | 
 class Doubt:
     """Uncertainty of a fit's surface.
 
-    The covariance of a code holds near the fit only. So a coordinate counts as unknown if most of what it moves lies
-    away from the scan: what is not seen may be in quite another place.
+    The covariance of a code holds near the fit only, and what the scan hides may be in quite another place. So a
+    coordinate counts as unknown if most of its motion is away from the scan.
     """
 
     away: float  # mean standard deviation of the surface, as a fraction of the diagonal
