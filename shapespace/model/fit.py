@@ -18,6 +18,7 @@ from shapespace.model.fit_preparation import FitPreparation, StartShapes
 from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted
 from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, SearchAccuracy
 from shapespace.model.fit_settings import SETTINGS, Attempt
+from shapespace.model.fit_uncertainty import Doubt, posterior_of
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import FitOptions
 from shapespace.model.part_exchange import SHORT, ShapeJudge
@@ -118,7 +119,11 @@ class _Fit:
             self._reach(REFINED)
             self.ended = self._late
             ratio = None
-            posterior = self._posterior(full, final)
+            doubt = Doubt.about(full, final, self.decoder)
+            if doubt and not self._late:
+                final, doubt = doubt.tested(middle, full, final, self.decoder)
+                self.ended = self._late
+            posterior = posterior_of(full, final)
             explained, seen = full.shares(final)
             if self._is_poor(explained, seen) and not self._late:
                 flip = np.array([-1, 1, 1])
@@ -128,7 +133,7 @@ class _Fit:
                 ratio = twin.cost / best.cost
             counts = full.count + middle.count, rough.count
         # The solver is returned first: decoding the result needs a solver too.
-        return self._answer(full, final, posterior, explained, seen, ratio, rival, counts)
+        return self._answer(full, final, posterior, explained, seen, ratio, rival, doubt, counts)
 
     @property
     def _late(self) -> bool:
@@ -299,14 +304,6 @@ class _Fit:
         away = one.placement(one.shape) - other.placement(other.shape)
         return float(np.linalg.norm(away, axis=1).mean() / one.placement.scale / self.decoder.reference.diagonal)
 
-    def _posterior(self, search: FitSearch, state: FitState) -> Posterior:
-        prior, fixed = self.constraints.prior, ~self.constraints.movable
-        try:
-            return Posterior.of(search.normal(state), prior, fixed)
-        except (NotPositiveDefiniteError, ValueError):  # ValueError includes LinAlgError
-            # Without derivatives only the prior is known.
-            return Posterior.of(np.zeros_like(prior.covariance), prior, fixed)
-
     def _is_poor(self, explained: float, seen: float) -> bool:
         if self.constraints.partial:
             return 1 - explained > SETTINGS.missed_of_part
@@ -321,6 +318,7 @@ class _Fit:
         seen: float,
         mirrored: float | None,
         rival: FitState | None,
+        doubt: Doubt | None,
         counts: tuple[int, int],
     ) -> Fitted:
         decoder, options = self.decoder, self.options
@@ -337,7 +335,7 @@ class _Fit:
         parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if options.points else []
         found = [surface.closest(part).distances for part in parts if not (self.deadline and self.deadline.passed)]
         every = np.concatenate(found) if found and len(found) == len(parts) else None
-        status, reason = self._status(state, explained, seen, mirrored, rival, shape)
+        status, reason = self._status(state, explained, seen, mirrored, rival, doubt, shape)
         return Fitted(
             code=code,
             covariance=posterior.covariance,
@@ -365,6 +363,7 @@ class _Fit:
         seen: float,
         mirrored: float | None,
         rival: FitState | None,
+        doubt: Doubt | None,
         shape: Shape,
     ) -> tuple[FitStatus, str]:
         """Return how the fit ended, and the reason in words."""
@@ -383,6 +382,8 @@ class _Fit:
             status = FitStatus.AMBIGUOUS
             apart = self._apart(rival, state)
             reason = f"{shares}, but another fit, {apart:.0%} of the diagonal away on average, is nearly as good."
+        elif doubt is not None:
+            status, reason = FitStatus.AMBIGUOUS, f"{shares}, but {doubt.words}"
         elif state.moved > SETTINGS.restless:
             status = FitStatus.STALLED
             reason = f"{shares}, but the last step still moved the model by {state.moved:.1%} of the diagonal."

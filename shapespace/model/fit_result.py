@@ -19,8 +19,9 @@ from shapespace.model.shape import Shape
 class FitStatus(StrEnum):
     """How a fit ended.
 
-    ``ambiguous``: another code or placement fits nearly as well. ``poor``: the scan is no such shape, or the search
-    failed. ``stalled``: the last step was still long. ``deadline``: the time was over.
+    ``ambiguous``: another code or placement fits nearly as well, or the scan says little about a part. ``poor``: the
+    scan is no such shape, or the search failed. ``stalled``: the last step was still long. ``deadline``: the time was
+    over.
     """
 
     CONVERGED = "converged"

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
@@ -151,10 +152,11 @@ class FitSearch:
             state = moved
         return state
 
-    def normal(self, state: FitState) -> FloatArray:
+    def normal(self, state: FitState, shown: NDArray[np.bool_] | None = None) -> FloatArray:
         """Return the information matrix (m, m) of scan and landmarks about the code, half a Hessian; 0 where fixed.
 
-        Residuals of neighbouring points are correlated, so only the independent share of them counts.
+        Residuals of neighbouring points are correlated, so only the independent share of them counts. The scan tells
+        nothing of coordinates that are not ``shown`` (m,).
         """
         pairs = self._pairs(state)
         sigma, n = self._sigma(pairs, state), pairs.of_scan
@@ -162,8 +164,10 @@ class FitSearch:
         share = independent_points(self._pairing.some.points, pairs.heights[:n], weights)
         A = self._motions(pairs, state)
         normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
+        if shown is not None:
+            normal[:, np.flatnonzero(~shown[self.constraints.movable])] = 0
         H = share / sigma**2 * normal.T @ (weights[:, None] * normal)
-        H += self._landmarks(state, self._derivatives(state))[0]
+        H += self._landmarks(state, self.derivatives_at(state))[0]
         count = int(self.constraints.movable.sum())
         # Eliminate motion and size, which are optimal for each code.
         rest = H[count:, count:] + 1e-9 * np.eye(len(H) - count) * H.diagonal().max()
@@ -202,12 +206,18 @@ class FitSearch:
         """Return the share of the scan that is explained and the share of the model's area that is seen."""
         if self._shared is not None and self._shared[0] is state:
             return self._shared[1]
-        most, surface = self.tolerance(state.sigma), self.surface(state.shape)
-        explained = surface.closest(state.placement.back(self.scan.points)).distances <= most
-        away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
-        areas = vertex_areas(surface.vertices, surface.vertex_faces.faces)
-        self._shared = state, (float(explained.mean()), float(areas @ (away <= most) / areas.sum()))
+        surface = self.surface(state.shape)
+        away = surface.closest(state.placement.back(self.scan.points)).distances
+        explained = float((away <= self.tolerance(state.sigma)).mean())
+        near, areas = self.at_scan(state)
+        self._shared = state, (explained, float(areas @ near / areas.sum()))
         return self._shared[1]
+
+    def at_scan(self, state: FitState) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Return whether vertices (V,) of the model lie at the scan, and the vertices' areas (V,)."""
+        surface = self.surface(state.shape)
+        away = self.scan.distances(state.placement(surface.vertices)) / state.placement.scale
+        return away <= self.tolerance(state.sigma), vertex_areas(surface.vertices, surface.vertex_faces.faces)
 
     def _sigma(self, pairs: Pairs, state: FitState) -> float:
         """Return the standard deviation of the heights, from their median, which outliers do not affect."""
@@ -231,7 +241,7 @@ class FitSearch:
         moves = carried(self._decoder, self._fine, state.shape, fields)
         return VertexDerivatives(state.code, np.ascontiguousarray(np.moveaxis(moves, 0, -1)), self._accuracy.mesh)
 
-    def _derivatives(self, state: FitState) -> FloatArray:
+    def derivatives_at(self, state: FitState) -> FloatArray:
         """Return derivatives (V, 3, f) of vertices by movable coordinates; cached while the code changes little."""
         last = self._last
         if (
@@ -244,7 +254,7 @@ class FitSearch:
 
     def _motions(self, pairs: Pairs, state: FitState) -> FloatArray:
         """Return derivatives (n, 3, f + 6 or 7) of the model's points by code, rotation, translation and size."""
-        return np.concatenate([pairs.carried(self._derivatives(state)), self._rigid(pairs.places)], axis=2)
+        return np.concatenate([pairs.carried(self.derivatives_at(state)), self._rigid(pairs.places)], axis=2)
 
     def _rigid(self, places: FloatArray) -> FloatArray:
         """Return derivatives (n, 3, 6 or 7) of points (n, 3) by rotation, translation and size."""
@@ -280,7 +290,7 @@ class FitSearch:
 
     def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
         try:
-            fields = self._derivatives(state)
+            fields = self.derivatives_at(state)
         except NotPositiveDefiniteError:
             return None
         weights = _robust(pairs.distances, width) * pairs.agree * pairs.mass
@@ -326,7 +336,7 @@ class FitSearch:
         return FitState(code, led, state.placement.after(motion), settled=settled, moved=moved)
 
     def _coarse_move(self, state: FitState, change: FloatArray) -> FloatArray:
-        moves = self._derivatives(state) @ change[self.constraints.movable]
+        moves = self.derivatives_at(state) @ change[self.constraints.movable]
         fine = self._decoder.finer(self._accuracy.mesh)
         if fine is None:
             return moves

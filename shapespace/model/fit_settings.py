@@ -35,6 +35,8 @@ class ScanFitSettings:
         restless: a fit has not converged if its last step was longer than this distance.
         elsewhere: a fit is ambiguous if another fit differs by at least this mean distance,
         nearly, beside: and costs at most ``nearly`` times as much plus ``beside``.
+        shown: the scan tells nothing of a coordinate if less than this share of its squared motion lies at the scan.
+        certain: a fit is ambiguous if the mean standard deviation of its surface exceeds this distance.
         mirrored: a scan counts as mirrored if its mirror image costs less than this share.
         rivals: maximum number of other fits that are refined to the end.
     """
@@ -66,6 +68,8 @@ class ScanFitSettings:
     elsewhere: float = 0.01
     nearly: float = 1.1
     beside: float = 3e-3
+    shown: float = 0.4
+    certain: float = 5e-3
     mirrored: float = 0.6
     rivals: int = 2
 

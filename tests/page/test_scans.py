@@ -255,13 +255,16 @@ def test_a_movement_too_small_to_see_is_none_and_a_scan_off_the_shape_is_doubted
         const far = { mean: 0, p95: 0 };
         const placement = { rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], translation: [3e-5, -2, -1e-9], scale: 1 };
         const answer = { status: 'converged', distances: { scan: far, model: far }, explained: 1, seen: 1, placement };
-        const [sure, doubtful] = [{}, { status: 'deadline', explained: 0.2 }].map((change) =>
+        const little = { status: 'ambiguous', reason: '9% lie, but the scan says little about a, 0.9% away. Send.' };
+        const [sure, doubtful, open] = [{}, { status: 'deadline', explained: 0.2 }, little].map((change) =>
             fitInWords({ ...answer, noise: 0, ...change }, { file: 'a', model: 'b', diagonal: 2 }));
-        return [sure.more[0], doubtful.words.at(-1)];
+        return [sure.more[0], doubtful.words.at(-1), open.title, open.words.at(-1)];
     }"""
-    place, doubt = studio.page.evaluate(script)
+    place, doubt, title, little = studio.page.evaluate(script)
     assert "moved by (0, −2, 0)" in place
     assert "Perhaps it is no shape of this model" in doubt
+    assert title == "b fits a, but another shape may fit as well"
+    assert little == "9% lie, but the scan says little about a, 0.9% away. If you can, scan more sides."
 
 
 def test_a_part_is_fitted_as_a_part(visit: Visit, given: Given) -> None:

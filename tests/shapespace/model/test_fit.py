@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray, IntArray
@@ -215,6 +216,22 @@ def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: Sha
     assert given.error(found) < 0.005
     assert found.seen < 0.9 < found.explained
     assert np.trace(found.covariance) > np.trace(whole.covariance)
+
+
+def test_a_fit_is_ambiguous_where_the_scan_says_little(figure: ShapeModel, plain: Plain) -> None:
+    given, _ = plain(3)
+    moved = np.linalg.norm(figure.jacobian(given.code)[:, :, figure.latents.names.index("left knee")], axis=1)
+    leg = moved > 0.5 * moved.max()
+    nearest = cKDTree(given.shape).query(points := given.points())[1]
+    scan = points[~leg[nearest]]
+    found = figure.fit_scan(scan, partial=True)
+    assert found.status is FitStatus.AMBIGUOUS
+    assert "the scan says little about left knee:" in found.reason
+    assert "Scan the other sides too, or send landmarks" in found.reason
+    # Landmarks on the leg tell where it is.
+    told = [Landmark(int(k), given.shape[k].tolist()) for k in np.flatnonzero(leg)[::20]]
+    found = figure.fit_scan(scan, partial=True, landmarks=told)
+    assert found.status is FitStatus.CONVERGED, found.reason
 
 
 def test_a_piece_that_does_not_belong_is_left_out(figure: ShapeModel) -> None:

@@ -70,7 +70,7 @@ export function fitInWords(answer, { file, model, diagonal }) {
   const size = diagonal * placement.scale; // in the scan's units, like the distances
   const titles = {
     converged: ["good", `${model} fits ${file}`],
-    ambiguous: ["fair", `${model} fits ${file}, but another shape fits almost as well`],
+    ambiguous: ["fair", `${model} fits ${file}, but another shape may fit as well`],
     stalled: ["fair", `${model} fits ${file}. The search stopped early`],
     poor: ["poor", `${file} is not a shape of this model, or the search failed`],
     deadline: ["fair", `The time limit is reached. This is the best fit to ${file} so far`],
@@ -87,7 +87,7 @@ export function fitInWords(answer, { file, model, diagonal }) {
         ? "Most of the scan lies off the shape. Perhaps it is no shape of this model."
         : "For a better fit, use fewer points: a few thousand are enough.",
     );
-  if (status === "ambiguous") words.push(sentence(answer.reason));
+  if (status === "ambiguous") words.push(`${sentence(answer.reason)} If you can, scan more sides.`);
   if (typeof mirrored === "number" && mirrored < 0.5) {
     words.push("The mirror image fits much better. Perhaps one axis of the file has the wrong sign.");
   }
