@@ -31,6 +31,7 @@ from shapespace.service.use_cases.forms import (
     UploadError,
     read_form,
 )
+from shapespace.service.use_cases.shape_formats import repeated_member
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}
@@ -236,6 +237,8 @@ def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
         content = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:
         raise MeshError(f"not JSON: {reason(error)}") from None
+    if name := repeated_member(bytes(data)):
+        raise MeshError(f"it has the member {name!r} twice")
     if not isinstance(content, dict) or "vertices" not in content:
         raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
     vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")

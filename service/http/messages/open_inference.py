@@ -29,7 +29,7 @@ OUTPUTS: tuple[OutputName, ...] = ("nric", "vertices")
 
 
 class _Message(BaseModel):
-    # Clients may send members that are meant for other servers; the protocol says to ignore them.
+    # Clients may send members that are meant for other servers; the protocol leaves them to each server.
     model_config = ConfigDict(extra="ignore")
 
 
