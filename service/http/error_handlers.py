@@ -160,6 +160,7 @@ _ADVICE = {kind: f"Send {wanted} for {{name}}." for kind, wanted in WANTED.items
     "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
     "too_short": "Send {min_length} or more entries for {name}, not {actual_length}.",
     "too_long": "Send {max_length} or fewer entries for {name}, not {actual_length}.",
+    "string_unicode": "Correct {name}: it has a text that is no Unicode.",
     "value_error": "Correct {name}: {error}.",
     **dict.fromkeys(("model_attributes_type", "model_type", "dict_type"), "Send a JSON object for {name}."),
 }

@@ -86,6 +86,8 @@ REQUESTS = {
     ),
     "times stand still": post(PATHS, {"keyframes": [OK, OK], "times": [1, 1]}, 422, "invalid-request", "increase"),
     "times too few": post(PATHS, {"keyframes": [OK, OK], "times": [1]}, 422, "invalid-request", "send as many"),
+    "a number as a name": post(PATHS, {"keyframes": [OK, OK], "name": 1}, 422, "invalid-request", "a text for name"),
+    "an empty name": post(PATHS, {"keyframes": [OK, OK], "name": ""}, 422, "invalid-request", "1 or more characters"),
     "one frame": post(PATHS, {"keyframes": [OK, OK], "frames": 1}, 422, "invalid-request", "at least 2 for frames"),
     "half a frame": post(PATHS, {"keyframes": [OK, OK], "frames": 2.5}, 422, "invalid-request", "whole number"),
     "too many frames": post(PATHS, {"keyframes": [OK, OK], "frames": 201}, 422, "too-many-frames", "limit is 200"),
