@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -23,8 +21,6 @@ from shapespace.model.shape import Diagnostics, Quality
 
 #: Bytes in which values are counted at once; counting ends after the piece in which they exceed the limit.
 _PIECE = 2**16
-#: A string of JSON, with the colon after the name of a member; or a bracket of an object.
-_NAME = re.compile(rb'[{}]|"((?:[^"\\]++|\\.)*+)"(\s*+:)?', re.DOTALL)
 #: Numbers in diagnostics, of which a summary has the largest.
 _FIGURES = ("iterations", "residual", "flipped_faces", "integrability")
 
@@ -43,25 +39,6 @@ def holds_more_values(text: bytes, most: int) -> bool:
         if count > most:
             return True
     return False
-
-
-def repeated_member(text: bytes) -> str | None:
-    """Return a name that an object in valid JSON has twice, cut to 60 characters; None if there is none.
-
-    Parsers silently take the last of both. Numbers cost nothing here, because only names and brackets are looked at.
-    """
-    objects: list[set[bytes]] = []
-    for found in _NAME.finditer(text):
-        if found[0] == b"{":
-            objects.append(set())
-        elif found[0] == b"}":
-            objects.pop()
-        elif found[2]:
-            name = json.loads(b'"%b"' % found[1]).encode(errors="replace") if b"\\" in found[1] else found[1]
-            if name in objects[-1]:
-                return name.decode()[:60]
-            objects[-1].add(name)
-    return None
 
 
 def float32(array: NDArray) -> NDArray[np.float32]:

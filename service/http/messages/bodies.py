@@ -19,7 +19,8 @@ from pydantic import BaseModel, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.shape_formats import holds_more_values, repeated_member
+from shapespace.service.use_cases.json_names import repeated_member
+from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
 #: Maximum number of values in a body, counted by separators; after parsing they take at most 20 MB.

@@ -113,6 +113,8 @@ def test_what_comes_cut_short_or_says_a_thing_twice_is_refused(client: httpx.Cli
         ENCODE, headers={"Content-Type": "application/json"}, content=b'{"vertices": [], "faces": [], "vertices": []}'
     )
     assert "'vertices' twice" in twice.json()["detail"]
+    wide = client.post(ENCODE, headers={"Content-Type": "application/json"}, content='{"}}": "}"}'.encode("utf-16"))
+    assert wide.json()["type"] == "urn:shapespace:problem:invalid-mesh"
     assert client.post(FIT, files=FILE, params={"noise": "inf"}).json()["type"].endswith("not-finite")
 
 
