@@ -13,6 +13,7 @@ WANTED = {
     "too_short": "{min_length} or more entries",
     "too_long": "{max_length} or fewer entries",
     "string_type": "a text",
+    "string_too_short": "{min_length} or more characters",
     "string_too_long": "at most {max_length} characters",
     "greater_than": "a number above {gt:g}",
     "greater_than_equal": "a number of at least {ge:g}",

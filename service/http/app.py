@@ -82,6 +82,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         version=__version__,
         summary="A few numbers become a 3D shape.",
         lifespan=lifespan,
+        redirect_slashes=False,  # a redirect says nothing, and behind a proxy it may lead elsewhere
         middleware=_middleware(settings),
         dependencies=[Depends(known_query)],
         # Spans of OpenTelemetry, where a provider is configured. The stages of an answer have spans of their own.

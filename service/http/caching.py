@@ -11,6 +11,7 @@ from cachetools import LRUCache
 from fastapi import Request, Response
 
 from shapespace import __version__
+from shapespace.service.http.negotiation import listed
 
 
 def entity_tag(*parts: str | bytes) -> str:
@@ -30,7 +31,7 @@ def cache_headers(tag: str) -> dict[str, str]:
 def not_modified(request: Request, tag: str) -> Response | None:
     """Return 304 if the client has the answer already."""
     # "*" matches nothing: whether a code has a shape is known only once the shape has been computed.
-    known = {part.strip().removeprefix("W/") for part in request.headers.get("if-none-match", "").split(",")}
+    known = {part.strip().removeprefix("W/") for part in (listed(request.headers, "if-none-match") or "").split(",")}
     return Response(status_code=304, headers=cache_headers(tag)) if tag in known else None
 
 

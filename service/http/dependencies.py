@@ -27,8 +27,6 @@ from shapespace.service.operation.statistics import InferenceTally
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
 
-_Inferences = defaultdict[tuple[str, str], InferenceTally]
-
 
 @dataclass
 class Service:

@@ -103,20 +103,24 @@ async def _http(request: Request, error: Exception) -> Response:
     if error.status_code == HTTPStatus.NOT_FOUND:
         return problem(request.scope, "not-found", f"Nothing answers at {path}. /openapi.json lists every call.")
     if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
-        allowed = ", ".join(_allowed(request)) or (error.headers or {}).get("Allow", "")
-        detail = f"{path} does not take {method}. Use {allowed}."
-        return problem(request.scope, "method-not-allowed", detail, {"Allow": allowed})
+        methods = _methods(request)
+        # HEAD is answered as GET, by the middleware.
+        allowed = {"Allow": ", ".join([*methods, *(["HEAD"] if "GET" in methods else []), "OPTIONS"])}
+        if method == "OPTIONS":
+            return Response(status_code=HTTPStatus.NO_CONTENT, headers=allowed)
+        return problem(
+            request.scope, "method-not-allowed", f"{path} does not take {method}. Use {', '.join(methods)}.", allowed
+        )
     detail = "The body can't be read. Send one JSON object in UTF-8, as /openapi.json describes it."
     return problem(request.scope, "malformed-request", detail)
 
 
-def _allowed(request: Request) -> list[str]:
+def _methods(request: Request) -> list[str]:
     # The router names the methods of the first route only, but a path may have several routes.
     routes = request.app.router.routes
-    scopes = {
-        method: {**request.scope, "method": method} for method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE")
-    }
-    return [m for m, scope in scopes.items() if any(route.matches(scope)[0] is Match.FULL for route in routes)]
+    scopes = {method: {**request.scope, "method": method} for method in ("GET", "POST")}
+    found = [m for m, scope in scopes.items() if any(route.matches(scope)[0] is Match.FULL for route in routes)]
+    return found or ["GET"]  # the page's files, which no route here names
 
 
 async def _validation(request: Request, error: Exception) -> Response:
@@ -129,7 +133,7 @@ async def _validation(request: Request, error: Exception) -> Response:
     kind = "not-finite" if all(fault["type"] == "finite_number" for fault in faults) else "invalid-request"
     places = [fault["loc"][1:] if fault["loc"][:1] == ("body",) else fault["loc"] for fault in faults[:10]]
     errors = [
-        {"pointer": shortened("#/" + "/".join(map(str, place))), "detail": shortened(_advice(fault))}
+        {"pointer": shortened(_pointer(place)), "detail": shortened(_advice(fault))}
         for place, fault in zip(places, faults, strict=False)
     ]
     more = f" ({len(faults) - 1} more under errors.)" if len(faults) > 1 else ""
@@ -143,6 +147,11 @@ def _place(fault: Mapping[str, Any]) -> tuple[str | int, ...]:
     return tuple(part for part in way if not _TYPE.fullmatch(str(part))) + tuple(ends)
 
 
+def _pointer(place: tuple[str | int, ...]) -> str:
+    """Return a JSON pointer (RFC 6901); ``#`` is the whole body."""
+    return "#" + "".join(f"/{part}" for part in (str(part).replace("~", "~0").replace("/", "~1") for part in place))
+
+
 #: Name of a type in the place of a fault.
 _TYPE = re.compile(r"[a-z-]+\[.*\]")
 #: How to correct a fault that pydantic found, by its type.
@@ -151,6 +160,7 @@ _ADVICE = {kind: f"Send {wanted} for {{name}}." for kind, wanted in WANTED.items
     "finite_number": "Send finite numbers only: {name} is NaN or infinite.",
     "too_short": "Send {min_length} or more entries for {name}, not {actual_length}.",
     "too_long": "Send {max_length} or fewer entries for {name}, not {actual_length}.",
+    "string_unicode": "Correct {name}: it has a text that is no Unicode.",
     "value_error": "Correct {name}: {error}.",
     **dict.fromkeys(("model_attributes_type", "model_type", "dict_type"), "Send a JSON object for {name}."),
 }

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from starlette.datastructures import Headers
+
 from shapespace.service.http.problems import ProblemError
 
 #: Number of media ranges of an ``Accept`` that are read, the first ones; browsers send less than ten.
@@ -14,6 +16,11 @@ MOST_RANGES = 100
 def declared_type(headers: Mapping[str, str]) -> str:
     """Return the media type that a body declares, without parameters; empty if it declares none."""
     return headers.get("content-type", "").split(";")[0].strip().lower()
+
+
+def listed(headers: Headers, name: str) -> str | None:
+    """Return a header that is a list, and may come in several parts; None without it (RFC 9110, 5.3)."""
+    return ", ".join(headers.getlist(name)) or None
 
 
 def choose(

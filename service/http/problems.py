@@ -37,6 +37,7 @@ KINDS = {
     "request-timeout": ProblemKind(408, "The request came too slowly"),
     "body-too-large": ProblemKind(413, "Body too large"),
     "unsupported-media-type": ProblemKind(415, "Unsupported media type"),
+    "no-such-range": ProblemKind(416, "No such part of the file"),
     "misdirected": ProblemKind(421, "Another server's name"),
     "invalid-request": ProblemKind(422, "Invalid request"),
     "wrong-length": ProblemKind(422, "Wrong number of latent coordinates"),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict
+from http import HTTPStatus
 from typing import Any
 
 import numpy as np
 from fastapi import Request, Response
-from fastapi.responses import StreamingResponse
-from starlette.types import Receive, Scope, Send
+from fastapi.responses import FileResponse, StreamingResponse
+from starlette.types import Message, Receive, Scope, Send
 
 from shapespace.mesh.attributes import Topology
 from shapespace.model.latent_space import CheckedCode
@@ -18,6 +19,7 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Service
+from shapespace.service.http.problems import ProblemError
 from shapespace.service.limits.workers import Caller
 from shapespace.service.tracing import record_stages
 from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
@@ -120,6 +122,25 @@ def encoded_response(service: Service, written: EncodedFile, headers: Mapping[st
     if isinstance(written.content, bytes):
         return Response(written.content, headers=headers, media_type=media_type)
     return _PiecewiseResponse(written.content, headers, media_type)
+
+
+class RangedFile(FileResponse):
+    """A file of which clients may ask for parts. Starlette refuses a wrong ``Range`` in plain text."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file or a part of it; raises ProblemError for a part that it does not have."""
+
+        async def checked(message: Message) -> None:
+            if message.get("status") in (HTTPStatus.BAD_REQUEST, HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE):
+                size = self.headers["content-length"]
+                error = ProblemError(
+                    "no-such-range", f"The file has bytes 0 to {int(size) - 1}. Correct the header Range."
+                )
+                error.headers = {"Content-Range": f"bytes */{size}"}
+                raise error
+            await send(message)
+
+        await super().__call__(scope, receive, checked)
 
 
 class _PiecewiseResponse(StreamingResponse):

@@ -59,7 +59,10 @@ class Animation(Body):
         "last segment, back to the first keyframe, takes the mean time of the others.",
     )
     frames: Whole = Field(
-        30, ge=2, description="Number n of frames, including both ends; `loop` leaves out the last frame."
+        30,
+        ge=2,
+        description="Number n of frames, including both ends; `loop` leaves out the last frame. "
+        "At most `SHAPESPACE_MAX_FRAMES`, 600 by default.",
     )
     start: Number = Field(0.0, description="t of the first frame; below 0 extrapolates.")
     stop: Number = Field(1.0, description="t of the last frame; above 1 extrapolates.")
@@ -106,10 +109,11 @@ class Animation(Body):
 
     def codes(self, latents: LatentSpace, which: slice = slice(None)) -> list[list[float]]:
         """Return the codes (n, m) of all or some frames, periodic coordinates not reduced; raises LatentError."""
-        path = self._segments(latents, which)
-        share = path.share[:, None]
-        # This form gives both keyframes exactly, at share 0 and 1.
-        codes: list[list[float]] = ((1 - share) * path.first + share * path.last).tolist()
+        with np.errstate(all="ignore"):  # a client's times may overflow, which the check of codes finds
+            path = self._segments(latents, which)
+            share = path.share[:, None]
+            # This form gives both keyframes exactly, at share 0 and 1.
+            codes: list[list[float]] = ((1 - share) * path.first + share * path.last).tolist()
         return codes
 
     def memory(self, latents: LatentSpace, which: slice = slice(None)) -> Examples:

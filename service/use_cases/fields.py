@@ -1,4 +1,4 @@
-"""Types of numbers and objects in JSON, checked strictly."""
+"""Types of numbers and objects in JSON, and of numbers in queries, checked strictly."""
 
 from __future__ import annotations
 
@@ -15,13 +15,19 @@ Whole = Annotated[
     Field(strict=True),
     BeforeValidator(lambda given: int(given) if isinstance(given, float) and given.is_integer() else given),
 ]
+#: Numbers in queries and forms, in the same spelling for all. Python would accept 1_000 too.
+DIGITS = BeforeValidator(lambda given: given.replace("_", "?") if isinstance(given, str) else given)
+WholeText = Annotated[int, DIGITS]
+NumberText = Annotated[Annotated[float, Field(allow_inf_nan=False)] | None, DIGITS]
+#: An index in digits, without zeros in front: two spellings would name one coordinate twice.
+_INDEX = "0|[1-9][0-9]{0,5}"
 
 
 def _by_index(given: object) -> object:
     # Stops at the first fault: every member may have a fault.
     if isinstance(given, dict):
         for index, value in given.items():
-            if not re.fullmatch("[0-9]{1,6}", str(index)):
+            if not re.fullmatch(_INDEX, str(index)):
                 raise ValueError(f'{str(index)[:20]!r} is not an index; send numbers by index, as in {{"3": 0.5}}')
             if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise ValueError(f"the value at {index} is not a finite number")
@@ -32,7 +38,7 @@ def _by_index(given: object) -> object:
 NumbersByIndex = Annotated[
     dict[int, float],
     BeforeValidator(_by_index),
-    Field(json_schema_extra={"propertyNames": {"pattern": "^[0-9]{1,6}$"}}),
+    Field(json_schema_extra={"propertyNames": {"pattern": f"^({_INDEX})$"}}),
 ]
 #: Maximum number of members of an object, because each unknown member is reported.
 _MEMBERS = 32

@@ -99,6 +99,7 @@ class _Parser:
     def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
         self.parts: list[FormPart] = []
         self._body, self._start, self._stop, self._short = memoryview(body), 0, 0, 0
+        self._ended = False
         self._headers: dict[bytes, bytes] = {}
         self._header = b""
         if boundary is None:
@@ -115,12 +116,18 @@ class _Parser:
                     "on_headers_finished": self._on_headers_finished,
                     "on_part_data": self._on_part_data,
                     "on_part_end": self._on_part_end,
+                    "on_end": self._on_end,
                 },
             )
             # In one call, so that positions are positions in the body.
             parser.write(body)  # type: ignore[arg-type]
         except FormParserError:
             raise _unreadable("Invalid multipart data.") from None
+        if not self._ended:
+            raise _unreadable("It ends before its last boundary.", "Send all of it.")
+
+    def _on_end(self) -> None:
+        self._ended = True
 
     def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
         self._header = bytes(data[start : min(stop, start + LONGEST_HEADER)]).lower()

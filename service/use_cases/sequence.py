@@ -15,7 +15,7 @@ from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.files.archives import Buffer
 from shapespace.files.colouring import Colouring
 from shapespace.mesh.attributes import Topology
-from shapespace.model.latent_space import CheckedCode
+from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
@@ -42,7 +42,13 @@ def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) 
     """Return an id that holds an animation; raises TooManyFramesError, LatentError or PathTooLongError."""
     _require_frames(animation, most_frames)
     id = animation.to_id(model.digest, model.latents)
-    model.latents.codes(animation.codes(model.latents))  # every frame must be a code
+    try:
+        model.latents.codes(animation.codes(model.latents))  # every frame must be a code
+    except NotFiniteError:
+        raise NotFiniteError(
+            "The path leads so far away that the numbers overflow. Send smaller keyframes, times, start or stop; "
+            "they must be finite."
+        ) from None
     return id
 
 

@@ -31,6 +31,7 @@ from shapespace.service.use_cases.forms import (
     UploadError,
     read_form,
 )
+from shapespace.service.use_cases.json_names import repeated_member
 
 #: Media types of the formats that can be read, by name.
 FORMATS = READ_FORMATS | {"json": "application/json"}
@@ -231,11 +232,14 @@ def read_in_sandbox(
 
 
 def _read_json(data: memoryview, limits: Limits) -> tuple[FloatArray, IntArray]:
+    text = bytes(data)
     try:
         # orjson would crash at the end of its memory, where this module raises MemoryError.
-        content = json.loads(bytes(data))
+        content = json.loads(text.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise MeshError(f"not JSON: {reason(error)}") from None
+    if name := repeated_member(text):
+        raise MeshError(f"it has the member {name!r} twice")
     if not isinstance(content, dict) or "vertices" not in content:
         raise MeshError('not an object {"vertices": [[x, y, z], …], "faces": [[a, b, c], …]}')
     vertices = _triples("d", content["vertices"], "vertices must be lists of three numbers each")

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.use_cases.json_names import repeated_member
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
@@ -75,6 +76,13 @@ def read(text: bytes, model: type[M]) -> M:
 
 def parse(text: bytes) -> object:
     """Parse JSON with a bounded number of values; the model must refuse NaN and infinities. Raises as ``JSONBody``."""
+    message = _parse(text)
+    if name := repeated_member(text):
+        raise ProblemError("invalid-request", f"The JSON has the member {name!r} twice in one object. Send it once.")
+    return message
+
+
+def _parse(text: bytes) -> object:
     if holds_more_values(text, MOST_VALUES):
         raise ProblemError(
             "body-too-large", f"The body holds more than {MOST_VALUES} values. Send fewer in each request."
@@ -85,7 +93,7 @@ def parse(text: bytes) -> object:
         where, why = error.pos, error.msg
     try:
         if len(text) <= LENIENT:
-            return json.loads(text)  # accepts NaN
+            return json.loads(text.decode("utf-8-sig"))  # accepts NaN
     except json.JSONDecodeError as error:
         where, why = error.pos, error.msg
     except UnicodeDecodeError as error:

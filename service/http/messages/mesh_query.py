@@ -21,7 +21,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.dependencies import Format, one_of
 from shapespace.service.http.messages.json_query import read_query
-from shapespace.service.http.negotiation import choose
+from shapespace.service.http.negotiation import choose, listed
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Body, Number
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest
@@ -215,7 +215,7 @@ async def _frame(
     format: Annotated[Format, one_of(SHAPE_FORMATS)] = None,
 ) -> MeshOptions:
     formats = {name: f.media_type for name, f in SHAPE_FORMATS.items() if f.coloured or color.quantity is None}
-    chosen = choose(writable(formats), format, request.headers.get("accept"), _UNCOLOURED | UNAVAILABLE)
+    chosen = choose(writable(formats), format, listed(request.headers, "accept"), _UNCOLOURED | UNAVAILABLE)
     return MeshOptions(chosen, color, topology)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from shapespace.model.decoder import MeshChoice
@@ -29,7 +29,7 @@ OUTPUTS: tuple[OutputName, ...] = ("nric", "vertices")
 
 
 class _Message(BaseModel):
-    # Clients may send members that are meant for other servers; the protocol says to ignore them.
+    # Clients may send members that are meant for other servers; the protocol leaves them to each server.
     model_config = ConfigDict(extra="ignore")
 
 
@@ -42,6 +42,21 @@ class InputParameters(_Message):
 
 
 _Numbers = Annotated[list[Number], Field(fail_fast=True)]
+
+
+def _kind(data: object) -> str:
+    """Return which list data is, by its first element, so that a fault is told once and not for every kind."""
+    if data is None:
+        return "list[none]"
+    return "list[list]" if isinstance(data, list) and isinstance(next(iter(data), None), list) else "list[number]"
+
+
+_Data = Annotated[
+    Annotated[_Numbers, Tag("list[number]")]
+    | Annotated[list[_Numbers], Field(fail_fast=True), Tag("list[list]")]
+    | Annotated[None, Tag("list[none]")],
+    Discriminator(_kind),
+]
 
 
 def _as_json(schema: dict[str, Any]) -> None:
@@ -66,9 +81,7 @@ class InputTensor(_Message):
     ]
     datatype: Literal["FP32"]
     parameters: InputParameters = InputParameters(binary_data_size=None)
-    data: _Numbers | Annotated[list[_Numbers], Field(fail_fast=True)] | SkipJsonSchema[None] = Field(
-        None, description="The numbers, as one list or as a list for each row; absent if bytes follow."
-    )
+    data: _Data = Field(None, description="The numbers, as one list or as a list for each row; absent if bytes follow.")
 
 
 class OutputParameters(_Message):

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationEr
 from shapespace.model.options import descriptions
 from shapespace.service.http.messages.json_query import read_query
 from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.fields import Number, NumbersByIndex, Whole
+from shapespace.service.use_cases.fields import Number, NumbersByIndex, NumberText, Whole, WholeText
 from shapespace.service.use_cases.forms import OPTIONS
 
 M = TypeVar("M", bound=BaseModel)
@@ -30,6 +30,8 @@ _BODY_TYPES: dict[Any, Any] = {
     Sequence[float]: Annotated[list[Number], Field(min_length=3, max_length=3, fail_fast=True)],
     Mapping[int, float]: NumbersByIndex,
 }
+#: Types of options in queries and forms.
+_QUERY_TYPES: dict[Any, Any] = {int: WholeText, float | None: NumberText}
 
 
 def body_of(
@@ -54,7 +56,7 @@ def query_of(
     Mappings and sequences are JSON in the query.
     """
     json_types = {Mapping[int, float]: NumbersByIndex} | dict(types or {})
-    return _decorator(kind, {}, json_types, (), limits)
+    return _decorator(kind, _QUERY_TYPES, json_types, (), limits)
 
 
 def options_of(kind: type[K], *given: BaseModel) -> K:

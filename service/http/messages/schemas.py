@@ -94,7 +94,14 @@ class TargetRequest(Body):
     """A vertex and the position that it should have."""
 
 
-@body_of(EditOptions, without=["sigma"])
+#: The limit of a server, which its settings may change.
+FEW_SAMPLES = {
+    "description": "Number of random codes to draw from the posterior, a Gaussian around the code with the "
+    "`covariance` of the answer: at most `SHAPESPACE_MAX_CODES`, 256 by default."
+}
+
+
+@body_of(EditOptions, without=["sigma"], samples=FEW_SAMPLES)
 class EditRequest(Body):
     """A code to start from, vertices that should be elsewhere, and the options of an edit."""
 
@@ -104,12 +111,12 @@ class EditRequest(Body):
     ] = Field(description="At least one target, in the frame in which the server answers the mesh of `latent`.")
 
 
-@query_of(EncodeOptions)
+@query_of(EncodeOptions, samples=FEW_SAMPLES)
 class EncodeQuery(BaseModel):
     """Options of ``encode`` in the query."""
 
 
-@body_of(EncodeOptions)
+@body_of(EncodeOptions, samples=FEW_SAMPLES)
 class EncodeRequest(Body):
     """Options of ``encode`` in the field `options` of a form."""
 
@@ -117,7 +124,9 @@ class EncodeRequest(Body):
 class SampleRequest(Body):
     """How many random codes, and which."""
 
-    count: Whole = Field(1, ge=1, description="Number of codes.", examples=[3])
+    count: Whole = Field(
+        1, ge=1, description="Number of codes, at most `SHAPESPACE_MAX_CODES`, 256 by default.", examples=[3]
+    )
     seed: Whole = Field(0, ge=0, lt=2**63, description="Seed of the random codes. The same seed gives the same codes.")
     distribution: Distribution = Field(
         Distribution.UNIFORM,

@@ -35,9 +35,9 @@ class CrossOrigin(CORSMiddleware):
         """Return the answer to a browser that asks whether a page may send a request."""
         answer = super().preflight_response(request_headers)
         if answer.status_code != HTTPStatus.OK:
-            what = bytes(answer.body).decode().removeprefix("Disallowed CORS ")
-            detail = f"Pages may not send this request: its {what} is not allowed. "
-            detail += "SHAPESPACE_CORS_ORIGINS names the origins whose pages may call."
+            what = bytes(answer.body).decode().removeprefix("Disallowed CORS ").replace("headers", "header")
+            detail = f"Pages may not send this request: its {what} is not allowed. Allowed are the origins in "
+            detail += f"SHAPESPACE_CORS_ORIGINS, {', '.join(self.allow_methods)}, and {', '.join(self.allow_headers)}."
             body, _ = description("cross-origin", detail)
             answer = Response(body, answer.status_code, {"Vary": "Origin"}, MEDIA_TYPE)
         answer.headers["X-Request-ID"] = request_id_of(request_headers)

@@ -9,6 +9,7 @@ from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.service.http.middleware.base import HTTPMiddleware
+from shapespace.service.http.negotiation import listed
 
 #: Binary formats: floating-point numbers that gzip makes hardly smaller, and archives. Events, which must not wait.
 EXCLUDED = (
@@ -17,8 +18,8 @@ EXCLUDED = (
 )  # fmt: skip
 #: End of the entity tag of a compressed answer.
 SUFFIX = '-gzip"'
-#: A client that refuses gzip.
-REFUSED = re.compile(r"gzip\s*;\s*q=0(\.0*)?\s*(,|$)")
+#: A client that accepts gzip, by a weight above 0.
+ACCEPTED = re.compile(r"(^|,)\s*(x-)?gzip\s*(;\s*q\s*=(?!\s*0(\.0*)?\s*(,|$))|,|$)")
 
 
 class Compress(HTTPMiddleware):
@@ -34,10 +35,14 @@ class Compress(HTTPMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, with the tags that routes know, and compress its answer."""
-        known = Headers(scope=scope).get("if-none-match", "")
+        headers = Headers(scope=scope)
+        known = listed(headers, "if-none-match") or ""
+        accepted = ACCEPTED.search((listed(headers, "accept-encoding") or "").lower())
+        scope["headers"] = [*scope["headers"]]  # in the same scope, in which the router notes the route
+        changed = MutableHeaders(scope=scope)
+        changed["accept-encoding"] = "gzip" if accepted else "identity"  # what the middleware looks for
         if SUFFIX in known:
-            scope["headers"] = [*scope["headers"]]  # in the same scope, in which the router notes the route
-            MutableHeaders(scope=scope)["if-none-match"] = known.replace(SUFFIX, '"')
+            changed["if-none-match"] = known.replace(SUFFIX, '"')
 
         async def tagged(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -50,5 +55,4 @@ class Compress(HTTPMiddleware):
                     headers["etag"] = tag[:-1] + SUFFIX
             await send(message)
 
-        refused = REFUSED.search(Headers(scope=scope).get("accept-encoding", "").lower())
-        await (self.app if refused else self._gzip)(scope, receive, tagged)
+        await self._gzip(scope, receive, tagged)

@@ -16,7 +16,7 @@ UNREAD_BYTES = 256 * 2**20
 #: Bytes of an answer that are sent at once, and of a compressed body that are unpacked at once.
 PIECE_BYTES = 2**18
 #: Window sizes by which zlib tells the formats of ``Content-Encoding``.
-WINDOWS = {"gzip": 16 + zlib.MAX_WBITS, "deflate": zlib.MAX_WBITS}
+WINDOWS = {"gzip": 16 + zlib.MAX_WBITS, "x-gzip": 16 + zlib.MAX_WBITS, "deflate": zlib.MAX_WBITS}
 
 
 class LimitBody(HTTPMiddleware):

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from pydantic import Field
 
 from shapespace.files.animated_gltf import FRAMES_PER_SECOND
 from shapespace.model.shape import Quality
@@ -36,10 +37,11 @@ from shapespace.service.http.messages.mesh_query import (
     choose_topology,
 )
 from shapespace.service.http.messages.schemas import InterpolationAnswer
-from shapespace.service.http.negotiation import choose
+from shapespace.service.http.negotiation import choose, listed
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
 from shapespace.service.use_cases.animation import Animation
+from shapespace.service.use_cases.fields import DIGITS, WholeText
 from shapespace.service.use_cases.sequence import (
     find_interpolation,
     frame_code,
@@ -99,7 +101,9 @@ async def get_interpolation(
     color: ColorQuery = NO_COLOR,
     topology: TopologyQuery = None,
     fps: Annotated[
-        float | None, Query(ge=1, le=MOST_FPS, description="Frames per second of GLB, USD and USDZ; by default 30.")
+        Annotated[float, Field(ge=1, le=MOST_FPS)] | None,
+        DIGITS,
+        Query(description="Frames per second of GLB, USD and USDZ; by default 30."),
     ] = None,
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
@@ -144,7 +148,7 @@ async def get_frame(
     request: Request,
     caller: CallerDependency,
     id: Id,
-    k: Annotated[int, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
+    k: Annotated[WholeText, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
     options: FrameQuery,
     quality: QualityQuery = Quality.AUTO,
     examples: ExamplesQuery = True,
@@ -167,4 +171,4 @@ def _choose_format(request: Request, format: str | None, color: ColourParameters
     types = {name: kind for name, kind in MEDIA_TYPES.items() if color.quantity is None or name not in _UNCOLOURED}
     why = UNAVAILABLE if color.quantity is None else _UNCOLOURED | UNAVAILABLE
     # OBJ holds one frame, so an animation is a zip of OBJ files.
-    return choose(writable(types), "zip" if format == "obj" else format, request.headers.get("accept"), why)
+    return choose(writable(types), "zip" if format == "obj" else format, listed(request.headers, "accept"), why)

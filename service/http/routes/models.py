@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import FileResponse
 from pydantic import ValidationError
 
 from shapespace.files.reading import OCTET_STREAM
@@ -22,6 +21,7 @@ from shapespace.service.http.messages.cards import (
     ModelSummary,
 )
 from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.responses import RangedFile
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -47,7 +47,7 @@ async def model_card(service: ServiceDependency, model: Model) -> ModelCard:
 
 @router.get(
     "/{name}/decoder.onnx",
-    responses=binary({"onnx": OCTET_STREAM}, "The file `decoder.onnx` of the bundle.") | problems(404, 422),
+    responses=binary({"onnx": OCTET_STREAM}, "The file `decoder.onnx` of the bundle.") | problems(404, 416, 422),
     response_class=Response,
 )
 async def model_decoder(request: Request, model: Model) -> Response:
@@ -59,7 +59,7 @@ async def model_decoder(request: Request, model: Model) -> Response:
     tag = entity_tag("decoder", model.manifest.files[entry.file].sha256)
     if unchanged := not_modified(request, tag):
         return unchanged
-    return FileResponse(model.folder / entry.file, media_type=OCTET_STREAM, headers=cache_headers(tag))
+    return RangedFile(model.folder / entry.file, media_type=OCTET_STREAM, headers=cache_headers(tag))
 
 
 def _generalisation(figures: Mapping[str, Any]) -> GeneralisationAnswer | None:

@@ -140,7 +140,7 @@ async def model_ready(model: Model) -> ModelReadiness:
 async def infer(service: ServiceDependency, request: Request, caller: CallerDependency, model: Model) -> Response:
     """Lengths and angles, vertices, or both, for latent codes."""
     message, tail = await asyncio.to_thread(read_request, await request.body(), request.headers.get(HEADER))
-    require_count(message.inputs[0].shape[0], service.settings.max_codes)
+    require_count(message.inputs[0].shape[0], service.settings.max_codes, "inputs[0].shape")
     options, write = message.parameters, partial(write_answer, message, model)
     tally, began = service.inferences[model.manifest.name, model.manifest.version], time.perf_counter()
     try:

@@ -12,7 +12,6 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import FileResponse
 from starlette.datastructures import Headers
 from starlette.routing import BaseRoute, Mount
 from starlette.staticfiles import NotModifiedResponse, StaticFiles
@@ -22,7 +21,7 @@ from shapespace.files.poster import poster
 from shapespace.page_scripts import PAGE, joined_scripts
 from shapespace.service.http.caching import CachedAnswer, entity_tag
 from shapespace.service.http.dependencies import Model, ServiceDependency
-from shapespace.service.http.responses import cached_response
+from shapespace.service.http.responses import RangedFile, cached_response
 
 router = APIRouter(include_in_schema=False)
 
@@ -42,7 +41,7 @@ class TaggedFiles(StaticFiles):
     ) -> Response:
         """Return a file, or 304 if the client has it already."""
         tag = _tag(os.fspath(full_path), stat_result.st_mtime_ns)
-        response = FileResponse(full_path, status_code, stat_result=stat_result)
+        response = RangedFile(full_path, status_code, stat_result=stat_result)
         return self._answer(response, tag, scope)
 
     def _answer(self, response: Response, tag: str, scope: Scope) -> Response:

@@ -32,7 +32,7 @@ from shapespace.service.http.messages.schemas import (
     VerticesAnswer,
     VerticesRequest,
 )
-from shapespace.service.http.negotiation import choose
+from shapespace.service.http.negotiation import choose, listed
 from shapespace.service.http.responses import cached_response, encoded_response, file_headers, shape_response
 from shapespace.service.use_cases.batch import Timings, require_count
 from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, blend_shapes_file, nric_file, vertices_file
@@ -114,7 +114,7 @@ async def post_vertices(
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
 ) -> Response:
     """Positions of many shapes."""
-    chosen = choose(VERTICES_TYPES, format, request.headers.get("accept"))
+    chosen = choose(VERTICES_TYPES, format, listed(request.headers, "accept"))
     require_count(len(body.latents), service.settings.max_codes)
     written = await vertices_file(
         service.workers,

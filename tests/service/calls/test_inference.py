@@ -1,6 +1,7 @@
 """The Open Inference Protocol, tested with Triton's client."""
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -247,6 +248,11 @@ FAULTS: dict[str, tuple[Any, int, str]] = {
     "numbers as text": (body(data=["1", 2, 3, 4, 5, 6]), 422, "Send a number for inputs[0].data[0]"),
     "a boolean in shape": (body(shape=[True, 3], data=[1, 2, 3]), 422, "inputs[0].shape[0]"),
     "a text in shape": (body(shape=["2", 3]), 422, "whole number for inputs[0].shape[0]"),
+    "NaN in data": (
+        json.dumps(body(data=[[1, 2, 3], [4, 5, math.nan]])),
+        422,
+        "inputs[0].data[1][2] is NaN or infinite.",
+    ),
     "a boolean in data": (body(data=[True, 2, 3, 4, 5, 6]), 422, "inputs[0].data"),
     "a boolean as a size": (body(data=None, parameters={"binary_data_size": True}), 422, "binary_data_size"),
     "no data": (body(data=None), 422, "either as data"),
@@ -266,6 +272,8 @@ def test_bad_requests_get_an_error_that_is_also_a_problem(client: httpx.Client, 
     assert answer.status_code == status
     assert says in answer.json()["error"]
     assert answer.json()["error"] == answer.json()["detail"]
+    places = [error["pointer"] for error in answer.json().get("errors", ())]
+    assert len(places) == len({*places}), "a fault is told once"
     assert answer.headers["Content-Type"] == "application/problem+json"
 
 

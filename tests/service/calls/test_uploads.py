@@ -88,6 +88,8 @@ def test_a_field_chooses_the_version(client: httpx.Client) -> None:
         ({"fixed": "{"}, "fixed is not JSON"),
         ({"options": "{"}, "options is not JSON"),
         ({"options": '{"nosie": 1}'}, "options.nosie"),
+        ({"options": '{"samples": 1, "samples": 2}'}, "the member 'samples' twice"),
+        ({"samples": "1_0"}, "whole number for samples"),
         ({"options": '{"samples": "2"}'}, "options.samples"),
         ({"options": '{"samples": 2}', "samples": "2"}, "samples as a field and in options"),
         ({"samples": ["1", "2"]}, "the field 'samples' twice"),
@@ -99,6 +101,21 @@ def test_a_wrong_field_is_named(client: httpx.Client, call: str, fields: dict[st
     assert answer.status_code == 422, answer.text
     assert answer.json()["type"].endswith("invalid-request")
     assert says in answer.json()["detail"]
+
+
+def test_what_comes_cut_short_or_says_a_thing_twice_is_refused(client: httpx.Client) -> None:
+    request = client.build_request("POST", ENCODE, files=FILE)
+    short = request.read().rpartition(b"\r\n--")[0]
+    answer = client.post(ENCODE, content=short, headers={"Content-Type": request.headers["Content-Type"]})
+    assert (answer.status_code, answer.json()["type"]) == (400, "urn:shapespace:problem:malformed-request")
+    assert "ends before its last boundary" in answer.json()["detail"]
+    twice = client.post(
+        ENCODE, headers={"Content-Type": "application/json"}, content=b'{"vertices": [], "faces": [], "vertices": []}'
+    )
+    assert "'vertices' twice" in twice.json()["detail"]
+    wide = client.post(ENCODE, headers={"Content-Type": "application/json"}, content='{"}}": "}"}'.encode("utf-16"))
+    assert wide.json()["type"] == "urn:shapespace:problem:invalid-mesh"
+    assert client.post(FIT, files=FILE, params={"noise": "inf"}).json()["type"].endswith("not-finite")
 
 
 def test_a_wrong_value_of_each_call_is_named(client: httpx.Client) -> None:

@@ -46,6 +46,10 @@ REQUESTS = {
     "a number of 5000 digits": post(MESH, f'{{"latent": [{"9" * 5000}]}}', 400, "malformed-request", "JSON"),
     "empty body": post(MESH, "", 422, "invalid-request", "Send a JSON object"),
     "a list as body": post(MESH, [1, 2, 3], 422, "invalid-request", "Send a JSON object"),
+    "a member twice": post(
+        MESH, '{"latent": [0, 0, 0], "lat\\u0065nt": [1, 1, 1]}', 422, "invalid-request", "the member 'latent' twice"
+    ),
+    "JSON in UTF-16": post(MESH, '{"latent": [0, 0, 0]}'.encode("utf-16"), 400, "malformed-request", "no UTF-8"),
     "no latent": post(MESH, {}, 422, "invalid-request", "Add 'latent'"),
     "latent null": post(MESH, {"latent": None}, 422, "invalid-request", "Send a list for latent"),
     "code too short": post(MESH, {"latent": [0.1]}, 422, "wrong-length", "Send exactly 3"),
@@ -82,11 +86,22 @@ REQUESTS = {
     ),
     "times stand still": post(PATHS, {"keyframes": [OK, OK], "times": [1, 1]}, 422, "invalid-request", "increase"),
     "times too few": post(PATHS, {"keyframes": [OK, OK], "times": [1]}, 422, "invalid-request", "send as many"),
+    "a number as a name": post(PATHS, {"keyframes": [OK, OK], "name": 1}, 422, "invalid-request", "a text for name"),
+    "an empty name": post(PATHS, {"keyframes": [OK, OK], "name": ""}, 422, "invalid-request", "1 or more characters"),
     "one frame": post(PATHS, {"keyframes": [OK, OK], "frames": 1}, 422, "invalid-request", "at least 2 for frames"),
     "half a frame": post(PATHS, {"keyframes": [OK, OK], "frames": 2.5}, 422, "invalid-request", "whole number"),
     "too many frames": post(PATHS, {"keyframes": [OK, OK], "frames": 201}, 422, "too-many-frames", "limit is 200"),
-    "a path beyond floats": post(PATHS, {"keyframes": [OK, [0, 0, 0]], "stop": 1e300}, 422, "not-finite", "finite"),
+    "a path beyond floats": post(
+        PATHS, {"keyframes": [OK, [0, 0, 0]], "stop": 1e300}, 422, "not-finite", "times, start or stop"
+    ),
     "too long a path": post(PATHS, {"keyframes": LONG_PATH}, 422, "path-too-long", "Send fewer keyframes"),
+    "a coordinate fixed twice": post(
+        f"{MODEL}/edit", {"latent": OK, "targets": [{"vertex": 0, "position": OK}], "fixed": {"0": 1, "00": 2}},
+        422, "invalid-request", "'00' is not an index",
+    ),
+    "a placement that says a thing twice": get(
+        f'{MESH}?place={{"scale":1,"scale":2}}', 422, "invalid-request", "the member 'scale' twice"
+    ),
     "unknown model": get("/v1/models/large", 404, "unknown-model", "/v1/models lists"),
     "unknown model's mesh": post("/v1/models/large/mesh", {"latent": OK}, 404, "unknown-model", "lists the models"),
     "a way out of the folder": get("/v1/models/..%2fsmall/mesh", 404, "not-found", "/openapi.json"),
@@ -95,6 +110,11 @@ REQUESTS = {
     "unknown call": get(f"{MODEL}/volume", 404, "not-found", "/openapi.json lists every call"),
     "unknown interpolation": get("/v1/interpolations/abc", 404, "unknown-interpolation", "POST the keyframes"),
     "frame as text": get("/v1/interpolations/abc/frames/x", 422, "invalid-request", "Send a whole number for k"),
+    "a frame in Python's spelling": get("/v1/interpolations/abc/frames/1_0", 422, "invalid-request", "number for k"),
+    "frames per second in Python's spelling": get(
+        "/v1/interpolations/abc?fps=2_4", 422, "invalid-request", "Send a number for fps"
+    ),
+    "a slash at the end": get(f"{MESH}/", 404, "not-found", "/openapi.json"),
     "wrong method": Bad("DELETE", MESH, 405, "method-not-allowed", "Use GET, POST"),
     "wrong method on a list": Bad("POST", "/v1/models", 405, "method-not-allowed", "Use GET"),
     "unknown format": get(f"{MESH}?format=fbx", 406, "not-acceptable", "obj (model/obj)"),
@@ -160,8 +180,12 @@ def test_a_frame_beyond_the_end_is_not_found(client: httpx.Client) -> None:
 
 
 def test_what_a_path_allows_is_said_in_the_header_too(client: httpx.Client) -> None:
-    assert client.put(MESH).headers["Allow"] == "GET, POST"
-    assert client.delete(PATHS).headers["Allow"] == "POST"
+    for path, allowed in {
+        MESH: "GET, POST, HEAD, OPTIONS", PATHS: "POST, OPTIONS", "/page/page.css": "GET, HEAD, OPTIONS"
+    }.items():  # fmt: skip
+        assert client.put(path).headers["Allow"] == allowed
+        asked = client.options(path)
+        assert (asked.status_code, asked.headers["Allow"], asked.content) == (204, allowed, b"")
 
 
 def test_refusals_list_the_choices(client: httpx.Client) -> None:
@@ -174,3 +198,7 @@ def test_refusals_list_the_choices(client: httpx.Client) -> None:
 def test_every_fault_of_a_body_is_listed(client: httpx.Client) -> None:
     problem = client.post(MESH, json={"latent": ["a", 0, None], "extra": 1}).json()
     assert [error["pointer"] for error in problem["errors"]] == ["#/latent/0", "#/extra"], "one for each list"
+    pointers = [
+        client.post(MESH, json=body).json()["errors"][-1]["pointer"] for body in ([], {"latent": OK, "a/b~": 1})
+    ]
+    assert pointers == ["#", "#/a~1b~0"]

@@ -44,7 +44,40 @@ def test_numbers_and_other_clients_get_the_plain_file(client: httpx.Client, form
     assert "Content-Encoding" not in answer.headers
 
 
-@pytest.mark.parametrize(("encoding", "pack"), [("gzip", gzip.compress), ("deflate", zlib.compress)])
+@pytest.mark.parametrize("encoding", ["GZIP", "x-gzip", "br, gzip;q=0.1", "gzip ; q=0.0", "gzip;q=0, br"])
+def test_every_answer_of_a_text_format_depends_on_accept_encoding(client: httpx.Client, encoding: str) -> None:
+    answer, _ = fetch(client, "obj", encoding)
+    assert ("Content-Encoding" in answer.headers) == ("q=0" not in encoding.replace("0.1", ""))
+    assert "Accept-Encoding" in answer.headers["Vary"]
+
+
+def test_lists_may_come_in_several_headers(client: httpx.Client) -> None:
+    tag = fetch(client, "obj", "gzip")[0].headers["ETag"]
+    for name, values, status in (
+        ("If-None-Match", ['"a"', tag], 304),
+        ("Accept-Encoding", ["br", "gzip"], 200),
+        ("Accept", ["image/png", "model/obj"], 200),
+    ):
+        headers = {"Accept": "model/obj", "Accept-Encoding": "gzip"}
+        headers.pop(name, None)
+        several = [*headers.items(), *((name, value) for value in values)]
+        answer = client.get(MESH, params={"latent": "0.1,0.2,0.3"}, headers=several)
+        assert (answer.status_code, answer.headers["ETag"]) == (status, tag), name
+
+
+def test_a_part_of_a_file_that_is_not_there_is_a_problem(client: httpx.Client) -> None:
+    whole = client.get("/page/page.css").content
+    assert client.get("/page/page.css", headers={"Range": "bytes=2-5"}).content == whole[2:6]
+    for path in ("/page/page.css", "/v1/models/freaky-torus/decoder.onnx"):
+        for wrong in ("bytes=999999999-", "bytes=5-1", "lines=1-2"):
+            answer = client.get(path, headers={"Range": wrong})
+            assert (answer.status_code, answer.json()["type"]) == (416, "urn:shapespace:problem:no-such-range")
+            assert answer.headers["Content-Range"].startswith("bytes */")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pack"), [("gzip", gzip.compress), ("x-gzip", gzip.compress), ("deflate", zlib.compress)]
+)
 def test_compressed_requests_are_read(client: httpx.Client, encoding: str, pack) -> None:  # type: ignore[no-untyped-def]
     headers = {"Content-Type": "application/json", "Content-Encoding": encoding}
     plain = client.post(MESH, json=CODE).raise_for_status()
