@@ -219,8 +219,7 @@ def test_shapes_that_take_their_time_are_asked_for_once(window: Open) -> None:
     studio.rest()
     studio.page.clock.fast_forward(1000)
     studio.frames(3)
-    fine = [asked["quality"] for asked in studio.asked if asked["mesh"] == "fine"]
-    assert fine == ["draft", "draft", "full"]
+    assert [asked["quality"] for asked in studio.asked if asked["mesh"] == "fine"] == ["draft", "draft", "full"]
 
 
 def test_a_draft_that_was_solved_after_all_is_not_asked_for_again(window: Open) -> None:
