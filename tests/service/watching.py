@@ -1,6 +1,7 @@
 """Observing a server from outside: waiting for a condition, and reading metrics."""
 
 import contextlib
+import secrets
 import socket
 import time
 from collections.abc import Callable
@@ -24,10 +25,12 @@ def eventually(holds: Callable[[], bool], seconds: float = 120) -> None:
 
 
 def free_port() -> int:
-    """A port of this machine on which nobody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    """A port on which nobody listens, below the ports that the system gives to connections and other servers."""
+    lowest = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    while True:
+        with contextlib.suppress(OSError), socket.socket() as free:
+            free.bind(("127.0.0.1", secrets.randbelow(lowest // 2) + lowest // 2))
+            return int(free.getsockname()[1])
 
 
 def children_of(pid: int | str) -> list[int]:
