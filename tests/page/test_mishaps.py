@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import Browser, Route
 
 from tests.page.conftest import CHROMIUM, Open, Visit
-from tests.page.studio import Hold, OpenPage
+from tests.page.studio import PATIENCE, Hold, OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
 from tests.service.watching import free_port
@@ -33,7 +33,8 @@ def test_without_scripts_the_calls_are_told(window: Open) -> None:
 
 
 def test_without_webgl_the_calls_are_told(browser: Browser, server: Server) -> None:
-    alone = browser.browser_type.launch(executable_path=CHROMIUM, args=["--disable-gpu", "--disable-3d-apis"])
+    flags = ["--disable-gpu", "--disable-3d-apis"]
+    alone = browser.browser_type.launch(executable_path=CHROMIUM, args=flags, timeout=1000 * PATIENCE)
     try:
         studio = OpenPage(alone.new_page(), server.url)
         studio.page.goto(studio.url)
