@@ -185,7 +185,8 @@ export class Files {
       keep(blob, `${name}-${what}.${extension}`);
       say(isGif ? "The GIF is saved." : "The video is saved.", { key: "video" });
     } catch (error) {
-      if (error.name !== "AbortError") say(error.message, { kind: "error", key: "video" }); // or the path has changed
+      // Otherwise the path has changed.
+      if (error.name !== "AbortError") say(error.message, { kind: "error", key: "video" });
     } finally {
       this.recording = false;
     }
