@@ -2,6 +2,11 @@
 
 import numpy as np
 import pytest
+from httpx._config import DEFAULT_TIMEOUT_CONFIG
+
+# A busy machine may take longer for an answer than the five seconds that httpx waits.
+for phase in ("connect", "read", "write", "pool"):
+    setattr(DEFAULT_TIMEOUT_CONFIG, phase, 120.0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -32,6 +32,9 @@ HEAD_BYTES = 32 * 2**10
 PARSE_BYTES = 2**14
 #: Seconds in which a client has to send a whole head, and in which it has to read at least a part of its answer.
 HEAD_SECONDS, STALL_SECONDS = 10.0, 30.0
+#: Seconds after an answer in which a client may use its connection again. They are more than clients keep one, which is
+#: 5 s in httpx and 15 s in aiohttp: a request on a connection that is just being closed is lost.
+IDLE_SECONDS = 20
 #: Seconds after a refusal in which further bytes are read and dropped: closing at once could lose the answer.
 LINGER_SECONDS = 1.0
 #: Most bytes that are read and dropped after an answer that came before the end of its request.
@@ -143,7 +146,7 @@ class Connection(H11Protocol):
             if self.conn.trailing_data[0]:
                 detail = f"The head of the request took over {HEAD_SECONDS:g} s. Send it again."
                 self._refuse("request-timeout", detail)
-            else:
+            elif self.timeout_keep_alive_task is None:  # else it has IDLE_SECONDS
                 self.transport.close()
         unsent = self.transport.get_write_buffer_size()
         if unsent != self._unsent:

@@ -19,7 +19,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 
-from shapespace.service.http.connections import HEAD_BYTES, Connection
+from shapespace.service.http.connections import HEAD_BYTES, IDLE_SECONDS, Connection
 from shapespace.service.logs import RateLimitedLog
 from shapespace.service.operation.metrics_port import MetricsPort
 from shapespace.service.repository.repository import ModelRepository
@@ -70,6 +70,7 @@ class Server(uvicorn.Server):
                 server_header=False,
                 proxy_headers=bool(settings.trusted_proxies),
                 forwarded_allow_ips=list(settings.trusted_proxies),
+                timeout_keep_alive=IDLE_SECONDS,
                 timeout_graceful_shutdown=1,
             )
         )

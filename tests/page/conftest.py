@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from shapespace.files.reading import read_arrays
-from tests.page.studio import OpenPage
+from tests.page.studio import PATIENCE, OpenPage
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT, Server, start, starting  # noqa: F401 - a fixture
 
@@ -50,7 +50,7 @@ def browser() -> Iterator[Browser]:
     It is closed after each file of tests, since no other event loop can run in this thread while it is open.
     """
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS, timeout=1000 * PATIENCE)
         yield browser
         browser.close()
 

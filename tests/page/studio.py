@@ -7,13 +7,14 @@ import io
 import json
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import CDPSession, Locator, Page, Request, Route
+from playwright.sync_api import CDPSession, Error, Locator, Page, Request, Route
 
 T = TypeVar("T")
 PATIENCE = 120.0  # seconds; the machine may be busy with other things
@@ -33,6 +34,22 @@ RESET = """() => {
     document.activeElement.blur();
     localStorage.clear();
     sessionStorage.clear();
+}"""
+
+
+#: Whether the full shape, no draft, is drawn, on the fine mesh if the model has one.
+RESTS = """() => {
+    const [stage, fine] = ['.stage', '#fine'].map((selector) => document.querySelector(selector));
+    if (!fine) return false;
+    const mesh = fine.disabled || fine.ariaPressed === 'false' ? 'coarse' : 'fine';
+    const { quality, shown } = stage.dataset;
+    return shown === mesh && quality === 'full' && stage.ariaBusy !== 'true';
+}"""
+
+#: Holds the timer that ends a movement by keys, of `REST` in hand.js.
+HOLD_KEYS = """() => {
+    window.timed = window.setTimeout;
+    window.setTimeout = (work, time) => window.timed(work, time === 700 ? 1e8 : time);
 }"""
 
 
@@ -127,9 +144,23 @@ class OpenPage:
 
     def rest(self) -> None:
         """Wait until the full shape, no draft, is drawn, on the fine mesh if the model has one."""
-        fine = "document.querySelector('#fine')"
-        script = f"{fine}.disabled || {fine}.getAttribute('aria-pressed') === 'false' ? 'coarse' : 'fine'"
-        self.eventually(lambda: (self.shown, self.quality) == (self.page.evaluate(script), "full") and not self.waits)
+
+        def rests() -> bool:
+            try:
+                return bool(self.page.evaluate(RESTS))
+            except Error:  # the page is being loaded
+                if self.page.is_closed():
+                    raise
+                return False
+
+        self.eventually(rests)
+
+    @contextmanager
+    def keys_in_a_row(self) -> Iterator[None]:
+        """Keys that are pressed inside are one movement, however slowly a busy machine presses them."""
+        self.page.evaluate(HOLD_KEYS)
+        yield
+        self.page.evaluate("() => { window.setTimeout = window.timed; }")
 
     def frames(self, count: int) -> None:
         """Wait until the browser has drawn some frames: what was to happen has happened by then."""

@@ -29,9 +29,7 @@ def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open
     assert studio["#without"].is_hidden()
     assert studio["#busy"].is_visible()
     assert studio.waits
-    drawn = studio.picture()
-    ink = (np.abs(drawn - drawn[0, 0]).max(axis=2) > 40).any(axis=1)
-    assert np.ptp(np.flatnonzero(ink)) > 0.7 * len(drawn), "the drawing fills the stage"
+    studio.eventually(lambda: height(studio.picture()) > 0.7)  # the drawing fills the stage
     assert studio["#random"].evaluate("e => e.closest('[inert]') !== null")
     asked = list(studio.asked)
     held.release()
@@ -43,6 +41,12 @@ def test_a_drawing_and_a_ring_until_the_scripts_arrive_and_no_alarm(window: Open
     assert [body for body in studio.asked if body == asked[0]] == asked
     scripts = [address.rpartition("/")[2] for address in studio.addresses if address.endswith(".js")]
     assert sorted(scripts) == sorted([*AHEAD, "main.js"])
+
+
+def height(picture: np.ndarray) -> float:
+    """Share of the height of a picture that is drawn on."""
+    ink = (np.abs(picture - picture[0, 0]).max(axis=2) > 40).any(axis=1)
+    return float(np.ptp(np.flatnonzero(ink)) / len(picture)) if ink.any() else 0.0
 
 
 #: Notes whether a notice was seen at any time before the first shape.

@@ -70,9 +70,9 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     studio.until_code(first)
     assert studio.messages == ""
     held = Hold(studio.page, "**/sample*")
-    studio["#random"].click()
-    studio["#random"].click()
-    studio.eventually(lambda: len(held.routes) == 2)
+    for count in (1, 2):
+        studio["#random"].click()
+        studio.eventually(lambda count=count: len(held.routes) == count)  # type: ignore[misc]
     held.routes.pop().continue_()
     second = studio.eventually(lambda: studio.code if studio.code != first else None)
     held.routes.pop().abort()
@@ -90,3 +90,16 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
         studio.coordinate(k).locator("[data-do=lock]").click()
     studio["#random"].click()
     studio.eventually(lambda: "All sliders are locked" in studio.messages)
+
+
+def test_a_random_shape_is_not_for_the_model_after(studio: OpenPage) -> None:
+    held = Hold(studio.page, "**/sample*")
+    studio["#random"].click()
+    studio.eventually(lambda: bool(held.routes))
+    studio["#model"].select_option("Figure")
+    studio.until_code([0] * 20)
+    with studio.page.expect_response("**/sample*"):
+        held.release()
+    studio.frames(3)
+    studio.rest()
+    assert (studio.code, studio.messages) == ([0] * 20, "")

@@ -45,6 +45,7 @@ def test_the_turntable_turns_until_the_shape_is_touched(studio: OpenPage) -> Non
     studio["#canvas"].click(position={"x": 60, "y": 300})
     assert studio["#spin"].get_attribute("aria-pressed") == "false"
     studio.eventually(lambda: "view" in studio.hash)
+    studio.frames(2)
     still = studio.picture()
     studio.frames(10)
     assert difference(still, studio.picture()) == 0

@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import Browser, Route
 
 from tests.page.conftest import CHROMIUM, Open, Visit
-from tests.page.studio import Hold, OpenPage
+from tests.page.studio import PATIENCE, Hold, OpenPage
 from tests.page.test_path import keyframes
 from tests.service.conftest import Server, Start
 from tests.service.watching import free_port
@@ -33,7 +33,8 @@ def test_without_scripts_the_calls_are_told(window: Open) -> None:
 
 
 def test_without_webgl_the_calls_are_told(browser: Browser, server: Server) -> None:
-    alone = browser.browser_type.launch(executable_path=CHROMIUM, args=["--disable-gpu", "--disable-3d-apis"])
+    flags = ["--disable-gpu", "--disable-3d-apis"]
+    alone = browser.browser_type.launch(executable_path=CHROMIUM, args=flags, timeout=1000 * PATIENCE)
     try:
         studio = OpenPage(alone.new_page(), server.url)
         studio.page.goto(studio.url)
@@ -90,13 +91,14 @@ def test_a_model_that_is_not_served_is_told(window: Open) -> None:
 
 def test_a_second_click_on_play_waits_for_the_same_frames(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 1))
+    studio.rest()
     held: list[Route] = []
     frames: list[int] = []
 
     def hold(route: Route) -> None:
-        number = len(route.request.post_data_json["latents"])
-        held.append(route) if number > 1 and not frames else route.continue_()
-        frames.append(number)
+        asked = route.request.post_data_json
+        held.append(route) if asked["quality"] == "draft" and not frames else route.continue_()
+        frames.extend([len(asked["latents"])] if asked["quality"] == "draft" else [])  # pictures are full shapes
 
     studio.page.route("**/vertices?*", hold)
     studio["#play"].click()
@@ -139,11 +141,12 @@ def test_theme_tab_and_seed_survive_a_reload(window: Open) -> None:
 def test_ten_arrow_keys_are_one_step(studio: OpenPage) -> None:
     slider = studio.coordinate(0).locator("input[type=range]")
     slider.focus()
-    for _ in range(10):
-        studio.page.keyboard.press("ArrowRight")
-    moved = float(slider.input_value())
-    assert moved > 0
-    studio.page.keyboard.press("Control+z")
+    with studio.keys_in_a_row():
+        for _ in range(10):
+            studio.page.keyboard.press("ArrowRight")
+        moved = float(slider.input_value())
+        assert moved > 0
+        studio.page.keyboard.press("Control+z")
     studio.until_code([0, 0, 0])
     assert studio["#undo"].is_disabled()
     studio["#redo"].click()
@@ -159,7 +162,7 @@ def test_ten_arrow_keys_are_one_step(studio: OpenPage) -> None:
 )
 def test_legend_and_diagnostics_lie_apart(visit: Visit, width: int, height: int) -> None:
     studio = visit("#model=with-fine&z=0.4,0,2&colour=stretch", size=(width, height))
-    studio.eventually(lambda: studio["#legend"].is_visible() and studio["#diagnostics li"].count() > 1)
+    studio.eventually(lambda: bool(studio["#legend .numbers"].inner_text()) and studio["#diagnostics li"].count() > 1)
     boxes = [studio[name].bounding_box() for name in (".tools", "#legend", "#diagnostics")]
     for i, a in enumerate(boxes):
         for b in boxes[:i]:
@@ -225,3 +228,24 @@ def test_a_model_left_and_opened_again_draws_its_pictures_once(window: Open) -> 
     ends = [asked for asked in studio.asked if len(asked["latents"]) > 1 and len(asked["latents"][0]) == 3]
     assert len(ends) == 2, "one call for each factor"
     assert studio.messages == ""
+
+
+def test_who_returns_before_another_model_has_arrived_stays(studio: OpenPage) -> None:
+    studio.slide(0, 0.1)
+    studio.until_code([0.1, 0, 0])
+    for back in (
+        lambda: studio["#model"].select_option("with-fine"),
+        lambda: studio.page.evaluate("location.hash = '#model=with-fine&z=0.2,0,0'"),
+    ):
+        held = Hold(studio.page, re.compile("figure/mesh.*mesh=coarse"))
+        studio["#model"].select_option("Figure")
+        studio.eventually(lambda held=held: bool(held.routes))  # type: ignore[misc]
+        back()
+        studio.eventually(lambda: studio["#model"].input_value() == "with-fine")
+        with studio.page.expect_response(held.routes[0].request.url):
+            held.release()
+        studio.frames(3)
+        assert studio["#model"].input_value() == "with-fine"
+        assert "Small torus" in studio.page.title()
+        studio.page.unroute_all()
+    studio.until_code([0.2, 0, 0])

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Route
 
 from tests.page.conftest import Visit
-from tests.page.studio import OpenPage, body, difference
+from tests.page.studio import Hold, OpenPage, body, difference
 
 #: Presses play and, once the time has moved on, pause; run in the page, so that a busy machine doesn't press too late.
 PLAY_A_WHILE = """async (button) => {
@@ -298,3 +298,16 @@ def test_pictures_of_keyframes_differ(studio: OpenPage) -> None:
     keyframes(studio, (-0.2, 0, 0), (0.2, 0, 0))
     first, second = (body(studio["#keyframes canvas"].nth(i))[..., :3] for i in range(2))
     assert difference(first.astype(int), second.astype(int)) > 0.05
+
+
+def test_a_film_of_a_path_that_changes_before_its_frames_are_there_is_none(visit: Visit) -> None:
+    studio = visit("#model=with-fine&keys=-0.2,0,0;0.2,0,1")
+    studio.tab("Path")
+    held = Hold(studio.page, re.compile("vertices"))
+    studio["#film"].click()
+    studio.eventually(lambda: any(len(route.request.post_data_json["latents"]) == 12 for route in held.routes))
+    studio["#loop"].check()
+    held.release()
+    studio.frames(3)
+    assert studio.messages == ""
+    assert "Play" in studio["#play"].inner_text()

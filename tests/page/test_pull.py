@@ -83,8 +83,10 @@ def test_pins_stay_are_pulled_together_and_removed_by_mouse_and_key(visit: Visit
     # A single pin can be dragged further.
     box = pins.nth(1).bounding_box()
     assert box
+    asked = len(sent)
     pull(studio, (box["x"] + 12, box["y"] + 12), (0, 25))
-    studio.eventually(lambda: len(sent[-1]["targets"]) == 2)
+    studio.eventually(lambda: len(sent) > asked and studio[".pin.busy"].count() == 0)
+    assert len(sent[-1]["targets"]) == 2
     assert pins.count() == 2
     studio.rest()
 
@@ -114,6 +116,34 @@ def test_a_press_pins_a_place_and_undo_takes_pins_along(visit: Visit) -> None:
     studio["#redo"].click()
     studio.eventually(lambda: studio[".pin"].count() == 2)
     studio["#clear-pins"].click()
+    assert studio[".pin"].count() == 0
+
+
+def test_a_pull_whose_answer_is_late_ends_by_undo_and_with_its_model(visit: Visit) -> None:
+    studio = visit("#model=figure")
+    studio["#pull"].click()
+    held = Hold(studio.page, "**/edit*")
+    place = hand(studio)
+    studio["#z0"].press("ArrowRight")
+    moved = [float(studio["#z0"].input_value()), *19 * [0]]
+    pull(studio, place, (20, -25))
+    studio.eventually(lambda: len(held.routes) == 1)
+    studio["#pull"].press("Control+z")
+    studio.until_code(moved)
+    assert studio[".pin"].count() == 0
+    assert "1 step" in (studio["#undo"].get_attribute("title") or "")
+    pull(studio, place, (20, -25))
+    studio.eventually(lambda: len(held.routes) == 2)
+    for model in ("with-fine", "figure"):
+        studio.page.evaluate("hash => { location.hash = hash; }", f"#model={model}")
+        studio.eventually(lambda model=model: studio["#model"].input_value() == model)  # type: ignore[misc]
+    studio.rest()
+    pull(studio, place, (20, -25))
+    studio.eventually(lambda: len(held.routes) == 3)
+    held.release()
+    studio.eventually(lambda: any(studio.code))
+    studio["#undo"].click()
+    studio.until_code([0] * 20)
     assert studio[".pin"].count() == 0
 
 
@@ -153,10 +183,8 @@ def test_a_press_beside_the_shape_pulls_it_and_marks_line_and_ring_say_what_happ
     assert studio["#hover"].is_hidden()
     mouse.move(x + 45, y - 40)
     studio.eventually(lambda: studio[".pin.busy"].count() == 1)
-    ends = studio["#threads line"].evaluate(
-        "line => ['x1', 'y1', 'x2', 'y2'].map((name) => Number(line.getAttribute(name)))"
-    )
-    assert np.hypot(ends[2] - ends[0], ends[3] - ends[1]) > 40, "a line joins the pin to the vertex, far away"
+    # From the next picture on, a line joins the pin to the vertex, far away.
+    studio.eventually(lambda: studio["#threads line"].evaluate("line => line.getTotalLength()") > 40)
     assert "view" not in studio.hash, "a near miss does not turn the view"
     mouse.up()
     held.release()

@@ -14,7 +14,7 @@ from shapespace.arrays import FloatArray
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.files.reading import read_arrays
 from tests.page.conftest import Visit
-from tests.page.studio import OpenPage, difference
+from tests.page.studio import PATIENCE, OpenPage, difference
 from tests.page.test_operation import AXE, check
 from tests.service.conftest import Server
 
@@ -78,6 +78,7 @@ def ghost(studio: OpenPage) -> float:
     box.uncheck()
     without = studio.until_different(with_it)
     box.check()
+    studio.until_different(without)
     return float((np.abs(with_it - without).max(axis=2) > 12).mean())
 
 
@@ -217,7 +218,7 @@ def test_the_best_fit_at_the_time_limit_is_shown(visit: Visit, given: Given) -> 
     studio = visit(FIGURE)
 
     def late(route: Route) -> None:
-        answer = route.fetch()
+        answer = route.fetch(timeout=1000 * PATIENCE)
         *shares, found = (json.loads(event.removeprefix("data: ")) for event in answer.text().split("\n\n")[:-1])
         assert [*shares[0]] == ["progress"]
         told = json.dumps(found | {"status": "deadline"})

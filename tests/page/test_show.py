@@ -212,7 +212,7 @@ def test_a_browser_that_records_no_pictures_keeps_no_empty_video(window: Open) -
     studio.tab("Files")
     studio["#turntable-seconds"].fill("1")
     studio["#turntable"].click()
-    studio.eventually(lambda: "This browser records no pictures of the shape." in studio.messages, 30)
+    studio.eventually(lambda: "This browser records no pictures of the shape." in studio.messages)
     assert "saved" not in studio.messages
 
 

@@ -1,6 +1,7 @@
 """Observing a server from outside: waiting for a condition, and reading metrics."""
 
 import contextlib
+import secrets
 import socket
 import time
 from collections.abc import Callable
@@ -24,10 +25,11 @@ def eventually(holds: Callable[[], bool], seconds: float = 120) -> None:
 
 
 def free_port() -> int:
-    """A port of this machine on which nobody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    """A port on which nobody listens, below those that systems give to connections and to servers of other tests."""
+    while True:
+        with contextlib.suppress(OSError), socket.socket() as free:
+            free.bind(("127.0.0.1", 2**14 + secrets.randbelow(2**14)))
+            return int(free.getsockname()[1])
 
 
 def children_of(pid: int | str) -> list[int]:

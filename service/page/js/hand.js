@@ -11,6 +11,8 @@ export class Hand {
     this.store = store;
     // A drag may end anywhere in the window.
     for (const end of ["pointerup", "pointercancel", "blur"]) addEventListener(end, () => this.#let());
+    // Before a pull begins: the slider loses the focus only after that.
+    addEventListener("pointerdown", () => this.#timer && this.#let(), { capture: true });
   }
 
   /** Watch a slider. */
@@ -37,6 +39,7 @@ export class Hand {
 
   #let() {
     clearTimeout(this.#timer);
+    this.#timer = 0;
     if (!this.#held) return;
     this.#held = false;
     this.store.set({ moving: false });

@@ -17,8 +17,9 @@ export class History {
     store.on(["space"], () => {
       this.#steps = [];
       this.#at = -1;
+      this.#add(); // although something may move as a model opens
     });
-    store.on(["space", "code", "moving", "playing", "pins"], () => this.#record());
+    store.on(["code", "moving", "playing", "pins"], () => this.#record());
     undo.addEventListener("click", () => this.#go(-1));
     redo.addEventListener("click", () => this.#go(1));
     addEventListener("keydown", (event) => {
@@ -33,20 +34,27 @@ export class History {
   }
 
   #record() {
-    const { code, placement, pins, moving, playing } = this.store;
+    const { code, pins, moving, playing } = this.store;
     if (!code || moving || playing) return;
-    if (this.#at < 0 || !sameCode(code, this.#steps[this.#at].code)) {
-      this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement, pins }].slice(-LONGEST);
-      this.#at = this.#steps.length - 1;
-    } else this.#steps[this.#at].pins = pins; // pins were added or removed without a change of shape
+    if (sameCode(code, this.#steps[this.#at].code))
+      this.#steps[this.#at].pins = pins; // added or removed alone
+    else this.#add();
+    this.#show();
+  }
+
+  #add() {
+    const { code, placement, pins } = this.store;
+    this.#steps = [...this.#steps.slice(0, this.#at + 1), { code, placement, pins }].slice(-LONGEST);
+    this.#at = this.#steps.length - 1;
     this.#show();
   }
 
   #go(by) {
-    const step = this.#steps[this.#at + by];
+    const to = this.#at + (by < 0 && this.store.moving ? 0 : by); // what still moves is undone first
+    const step = this.#steps[to];
     if (!step || this.store.playing) return;
-    this.#at += by;
-    this.store.set(step);
+    this.#at = to;
+    this.store.set({ ...step, code: [...step.code] }); // as a change, which ends a pull
     this.#show();
   }
 

@@ -127,7 +127,7 @@ new Pins(store, viewer, new Pull(store, viewer), {
   clear: find("#clear-pins"),
 });
 new ShapeLoop(store);
-new OnScreen(store, find(".stage"));
+new OnScreen(store, viewer.canvas, find(".stage"));
 const welcome = new Welcome(store, find("#welcome"));
 tabs(find("[role=tablist]"));
 sheet(find("#sheet"), find("main"));
@@ -135,7 +135,7 @@ new Look(store, viewer, find(".stage"));
 
 // The shape and its colours.
 store.on(["shape"], () => {
-  if (!store.shape) return find(".stage").removeAttribute("data-shown");
+  if (!store.shape) return;
   const { mesh, positions, placement, motion } = store.shape;
   viewer.show(
     mesh,
@@ -148,19 +148,10 @@ store.on(["wireframe", "normals", "material", "colour"], () => viewer.style(stor
 store.on(["colour", "against", "highlight", "regions", "repaint", "material"], () => {
   if (store.shape) viewer.paint(colouring.of(store.shape));
 });
-
-// What is drawn, and how long it took.
-let timed = null;
 viewer.canvas.addEventListener("drawn", () => {
-  const { shape } = store;
   find("#reset-view").hidden = !viewer.turned;
-  if (!shape || shape === timed) return;
-  timed = shape;
-  const took = performance.now() - shape.began;
-  const frame = store.playing ? "playing" : `${took.toFixed(0)} ms to the picture`;
-  find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
-  Object.assign(find(".stage").dataset, { shown: shape.mesh, quality: shape.quality ?? "draft" });
 });
+
 // Switches.
 for (const key of ["wireframe", "normals", "fine", "pull"]) toggle(find(`#${key}`), store, key);
 find("#reset-view").addEventListener("click", () => {
@@ -198,7 +189,9 @@ const draw = reporting(async () => {
   here.keep("seed", seed.value);
   here.keep("distribution", distribution.value);
   // The Gaussian of the population has no bounds, but what the page calls likely must not be outside.
-  take(store.space.clampAll(await api.sample(store.model, Number(seed.value), distribution.value)));
+  const { model, space } = store;
+  const code = space.clampAll(await api.sample(model, Number(seed.value), distribution.value));
+  if (store.space === space) take(code);
 });
 distribution.addEventListener("change", draw);
 find("#random").addEventListener("click", () => {
@@ -220,12 +213,14 @@ find("#share").addEventListener("click", () => {
 // Models.
 const picker = find("#model");
 let models = [];
-let opening;
+let opening; // the last model that was asked for
 picker.addEventListener(
   "change",
   reporting(async () => {
     try {
-      await openModel({ model: models.find(({ name }) => name === picker.value) });
+      const model = models.find(({ name }) => name === picker.value);
+      if (model === store.model) opening = store.space;
+      else await openModel({ model });
     } catch (error) {
       picker.value = store.model.name; // the model that is still shown
       throw error;
@@ -242,7 +237,9 @@ const isThere = ({ mesh, vertex }) => 3 * vertex < store.references[mesh]?.verti
  */
 function goTo({ code, keyframes, locked, view, pins, state }) {
   if (view) Object.assign(viewer, { view, turned: true });
-  const { space } = store;
+  const { model, space } = store;
+  opening = space;
+  picker.value = model.name; // another one may be on its way
   const wrapped = space.wrapAll(code ?? space.home);
   store.set({ playing: false, code: wrapped, keyframes, locked, pins: pins.filter(isThere), ...state });
 }

@@ -366,7 +366,7 @@ def test_bodies_are_limited_together(tight: Server) -> None:
         for sender in senders:
             sender.sendall(head % (MODEL.encode(), 4 * MIB))
             sender.sendall(bytes(4 * MIB - 1))
-        refused = select.select(senders, [], [], 10)[0]
+        refused = select.select(senders, [], [], 60)[0]
         assert refused, "24 MiB exceed the limit of 16, of which one address may have 12"
         assert {sender.recv(12) for sender in refused} == {b"HTTP/1.1 503"}
 

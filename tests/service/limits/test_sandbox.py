@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -95,10 +94,13 @@ def test_several_at_once_and_no_more_than_there_may_be(box: Sandbox) -> None:
     with ThreadPoolExecutor(8) as threads:
         found = list(threads.map(lambda _: call(box, "echo")[0]["pid"], range(16)))
         assert len(set(found)) <= 2
-        busy = [threads.submit(call, box, "wait", seconds=3) for _ in range(2)]
-        time.sleep(0.5)
+        deadlines = [Deadline(600), Deadline(600)]
+        busy = [threads.submit(box.call, "wait", deadline=each, memory=64 * MIB) for each in deadlines]
+        eventually(lambda: len(box._busy) == 2)
         with pytest.raises(LateError, match="every process was busy"):
             call(box, "echo", seconds=0.5)
+        for each in deadlines:
+            each.call_off()
         assert all(isinstance(future.exception(), LateError) for future in busy)
 
 
@@ -115,7 +117,7 @@ def test_what_nobody_waits_for_any_more_is_ended(box: Sandbox) -> None:
     pid, deadline = call(box, "echo")[0]["pid"], Deadline(60)
     with ThreadPoolExecutor(1) as threads:
         busy = threads.submit(box.call, "wait", deadline=deadline, memory=64 * MIB)
-        time.sleep(0.2)
+        eventually(lambda: len(box._busy) == 1)
         deadline.call_off()
         assert isinstance(busy.exception(60), LateError)
     assert not alive(pid)

@@ -12,6 +12,7 @@ import termios
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -22,6 +23,34 @@ from tests.service.conftest import ROOT, Server, Start
 from tests.service.watching import admitted, eventually
 
 MESH = "/v1/models/small/mesh"
+
+
+class Patient(Server):
+    """A server that waits long for running requests and open connections, as a busy machine needs it."""
+
+    program = (
+        "-c",
+        """
+from shapespace.service.http import server
+server.LINGER, server.FINISH, server.EXIT = 60, 60, 60
+from shapespace.service.__main__ import main
+main()
+""",
+    )
+
+
+@pytest.fixture
+def patient(small_models: Path) -> Iterator[Callable[..., Server]]:
+    servers: list[Server] = []
+
+    def start(**settings: object) -> Server:
+        servers.append(Patient(small_models, **settings))
+        return servers[-1]
+
+    yield start
+    for server in servers:
+        server.process.kill()
+        server.process.communicate()
 
 
 class Load:
@@ -55,8 +84,8 @@ class Load:
 
 
 @pytest.mark.parametrize("drain", [0, 1])
-def test_sigterm_under_load_loses_no_accepted_request(small_models: Path, start: Start, drain: float) -> None:
-    server = start(small_models, workers=2, drain=drain)
+def test_sigterm_under_load_loses_no_accepted_request(patient: Callable[..., Server], drain: float) -> None:
+    server = patient(workers=2, drain=drain)
     load = Load(server, 6)
     while load.outcomes["answered"] < 30:
         time.sleep(0.05)
@@ -86,8 +115,8 @@ def test_readiness_turns_first_and_everything_is_still_answered(small_models: Pa
     assert server.process.wait(60) == 0
 
 
-def test_a_connection_opened_before_the_end_is_answered_after_it(small_models: Path, start: Start) -> None:
-    server = start(small_models, drain=0)
+def test_a_connection_opened_before_the_end_is_answered_after_it(patient: Callable[..., Server]) -> None:
+    server = patient(drain=0)
     host, port = server.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port))) as connection:
         # Once this is answered, the earlier connection has been accepted too.
@@ -151,5 +180,5 @@ def test_an_interrupt_ends_it_at_once_and_answers_what_runs(small_models: Path, 
         server.process.send_signal(signal.SIGINT)
         assert answer.result().status_code == 503
         assert answer.result().json()["type"] == "urn:shapespace:problem:not-ready"
-        assert server.process.wait(30) == 0
+        assert server.process.wait(60) == 0
     assert "Traceback" not in server.log

@@ -1,6 +1,8 @@
 """The server under load, at its limits, and with settings that make no sense."""
 
 import asyncio
+import socket
+import time
 import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +18,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.__main__ import _serve
 from shapespace.service.http.app import create_app
+from shapespace.service.http.connections import IDLE_SECONDS
 from shapespace.service.limits.workers import Caller, DeadlineError, Workers
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, cpu_quota
@@ -161,3 +164,15 @@ def test_the_processors_of_a_container_are_those_of_its_quota(tmp_path: Path) ->
     (old / "cpu.cfs_quota_us").write_text("100000\n")
     (old / "cpu.cfs_period_us").write_text("100000\n")
     assert cpu_quota(tmp_path / "old") == 1
+
+
+@pytest.mark.long
+def test_an_answered_connection_is_kept_longer_than_clients_keep_it(narrow: httpx.Client) -> None:
+    place = narrow.base_url
+    with socket.create_connection((place.host, place.port or 80), timeout=120) as idle:
+        idle.sendall(b"GET /v2/health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert idle.recv(12) == b"HTTP/1.1 200"
+        answered = time.monotonic()
+        while idle.recv(2**16):
+            pass
+    assert time.monotonic() - answered > IDLE_SECONDS - 1

@@ -197,7 +197,7 @@ def test_the_end_of_a_server_ends_the_trial_of_a_bundle(folder: Path, start: Sta
     eventually(lambda: len(children(server)) == 2)  # one of them waits for uploads
     pids = children(server)
     server.process.send_signal(number)
-    assert server.process.wait(20) == (0 if number == signal.SIGTERM else -number)
+    assert server.process.wait(60) == (0 if number == signal.SIGTERM else -number)
     eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
     assert "is not served" not in server.log
     assert "Traceback" not in server.log
@@ -216,7 +216,7 @@ def test_a_server_can_be_ended_before_it_has_started(folder: Path, number: signa
         pids = children_of(process.pid)
         assert len(pids) == 1
         process.send_signal(number)
-        assert process.wait(20) == (0 if number == signal.SIGTERM else -number)
+        assert process.wait(60) == (0 if number == signal.SIGTERM else -number)
     eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids))
 
 

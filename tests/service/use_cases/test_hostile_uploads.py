@@ -102,7 +102,7 @@ def test_scenes_that_brought_the_server_down(name: str, small: Server) -> None:
     body = make()
     assert 0.5 * size < len(body) < 1.2 * size
     memory, seconds = peak_memory(small), processor_seconds(small)
-    with httpx.Client(base_url=small.url, timeout=30) as client:
+    with httpx.Client(base_url=small.url, timeout=120) as client:
         answer = client.post(ENCODE, params={"format": "glb"}, content=body)
         assert answer.status_code == 422
         assert answer.json()["type"] == "urn:shapespace:problem:invalid-mesh"

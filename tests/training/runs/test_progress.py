@@ -32,9 +32,12 @@ def test_what_takes_long_says_how_far_it_is(capfd: pytest.CaptureFixture[str]) -
 
 @pytest.mark.usefixtures("impatient")
 def test_what_cannot_say_how_far_it_is_says_how_long(capfd: pytest.CaptureFixture[str]) -> None:
+    said, end = "", time.monotonic() + 120
     with progress.waiting("elastic mean"):
-        time.sleep(2.3)
-    assert "elastic mean: 00:0" in capfd.readouterr().err
+        while "elastic mean: 0" not in said:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+            said += capfd.readouterr().err
 
 
 def test_a_stage_has_a_place_and_an_estimate_from_the_stages_before() -> None:
@@ -59,7 +62,8 @@ def test_every_stage_has_a_share_of_the_time() -> None:
     assert sum(progress.SHARES.values()) == 100
 
 
-def test_what_is_quick_says_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_quick_says_nothing(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "DELAY", 600)  # whatever else this machine does
     assert slowly(10, 0) == list(range(10))
     with progress.waiting("elastic mean"):
         pass

@@ -174,8 +174,10 @@ def test_a_signal_ends_the_run_with_a_sentence_and_all_its_processes(
     process.send_signal(number)
     said = process.communicate()[1]
     assert process.returncode == 128 + number
-    lines = [line for line in said.replace("\r", "\n").splitlines() if line.strip() and "sample" not in line]
-    assert lines == ["shapespace-train: stopped. The same command continues from here"]
+    # Before that, a slow machine says how far it is.
+    assert said.splitlines()[-1] == "shapespace-train: stopped. The same command continues from here"
+    assert said.count("shapespace-train:") == 1
+    assert "Traceback" not in said
     while processes(process.pid):  # ends by the tests' own limit, if ever
         time.sleep(0.01)
     shutil.rmtree(out)

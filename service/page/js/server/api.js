@@ -57,6 +57,7 @@ async function call(path, options = {}) {
       continue;
     }
     const problem = await response.json().catch(() => ({}));
+    options.signal?.throwIfAborted();
     throw new Problem(inWords(problem, response.status), response.status, problem);
   }
 }

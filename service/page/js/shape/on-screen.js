@@ -20,14 +20,17 @@ export class OnScreen {
   #timer = 0;
   #state = "busy";
 
-  /** @param {import("../store.js").Page} store */
-  constructor(store, stage) {
+  #timed = null; // the last shape that was drawn
+
+  /** `canvas` fires `drawn` after each picture. @param {import("../store.js").Page} store */
+  constructor(store, canvas, stage) {
     this.store = store;
     this.stage = stage;
     this.box = find("#diagnostics", stage);
     store.on(["shape"], () => this.#arrived());
     store.on(["code", "failed"], () => this.#moved());
     store.on(["shape", "usual"], () => this.#judge());
+    canvas.addEventListener("drawn", () => this.#drawn());
   }
 
   get #isCurrent() {
@@ -35,7 +38,20 @@ export class OnScreen {
     return Boolean(shape && code && sameCode(shape.code, code));
   }
 
+  /** Say what is drawn, and how long it took. */
+  #drawn() {
+    const { shape, playing } = this.store;
+    if (!shape || shape === this.#timed) return;
+    this.#timed = shape;
+    const took = performance.now() - shape.began;
+    const frame = playing ? "playing" : `${took.toFixed(0)} ms to the picture`;
+    find("#frame-time").textContent = `${shape.positions.length / 3} vertices · ${frame}`;
+    this.stage.dataset.shown = shape.mesh;
+    if (this.#isCurrent) this.stage.dataset.quality = shape.quality ?? "draft";
+  }
+
   #arrived() {
+    if (!this.store.shape) this.stage.removeAttribute("data-shown");
     this.#stop();
     this.#is(this.store.shape ? "" : "busy");
     this.#moved();

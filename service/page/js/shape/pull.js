@@ -29,6 +29,8 @@ export class Pull {
   #wanted = false;
   #busy = false;
   #answer = null;
+  #own = null; // the code at the start of the pull, or its last one
+  #abort = new AbortController();
 
   /** @param {import("../store.js").Page} store */
   constructor(store, viewer) {
@@ -42,6 +44,9 @@ export class Pull {
       }
       canvas.classList.toggle("pulling", store.pull);
       store.set({ hover: null });
+    });
+    store.on(["code"], () => {
+      if ((this.#held || this.#busy) && store.code !== this.#own) this.#leave();
     });
     // Before the controls get the event and turn the view.
     canvas.addEventListener("pointerdown", (event) => this.#pick(event), { capture: true });
@@ -92,6 +97,7 @@ export class Pull {
     const { pointerId: pointer, clientX, clientY } = event;
     this.#held = { pin, mesh, motion, there, positions, pointer, before, from: { clientX, clientY } };
     this.#last = this.#held;
+    this.#own = code;
     this.store.set({ moving: true });
   }
 
@@ -109,27 +115,29 @@ export class Pull {
 
   /** Send the newest targets, once the last request is answered. */
   async #solve() {
+    const { signal } = (this.#abort = new AbortController());
     this.#busy = true;
     this.store.set({ solving: this.#last.pin.vertex });
     while (this.#wanted) {
       this.#wanted = false;
       const { before, mesh, motion, there, positions } = this.#last;
       const { code } = before;
-      const { model, space, locked, pins } = this.store;
+      const { model, locked, pins } = this.store;
       const targets = this.#targets(pins, mesh, there);
       const began = awayFrom(targets, positions);
       try {
         const body = { latent: code, mesh, targets, anchored: true, fixed: fixedBy(locked, code) };
-        const { latent, placement: place, residual, distances } = await api.edit(model, body);
-        if (this.store.space !== space) break; // another model, or the same one anew
+        const { latent, placement: place, residual, distances } = await api.edit(model, body, signal);
+        signal.throwIfAborted(); // the pull may have ended after the answer had arrived
         const follows = residual < NEARER * rootMeanSquare(began);
         // The rest of the shape stays, and the coarse shape keeps its position relative to the fine one.
         const placement = there.clone().multiply(matrixOf(place)).multiply(motion.clone().invert());
         const kept = latent.map((value, k) => (locked[k] ? code[k] : value));
-        if (follows) this.store.set({ code: kept, placement });
-        else this.store.set(before);
+        this.#own = follows ? kept : code;
         this.#answer = { distances: follows ? distances : began, follows };
+        this.store.set(follows ? { code: kept, placement } : before);
       } catch (error) {
+        if (signal.aborted) return;
         report(error);
         break;
       }
@@ -137,6 +145,14 @@ export class Pull {
     this.#busy = false;
     this.store.set({ solving: null });
     if (!this.#held) this.#done();
+  }
+
+  /** Give up, because something else has changed the shape or the model. */
+  #leave() {
+    this.#abort.abort();
+    this.#held = this.#answer = null;
+    this.#busy = this.#wanted = false;
+    this.store.set({ moving: false, solving: null });
   }
 
   /** Return the pins as targets for the server, in the frame of the shape at the start of the pull. */

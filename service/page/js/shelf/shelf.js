@@ -73,6 +73,7 @@ export class Shelf {
     this.list.replaceChildren(...shapes.map((shape, i) => this.#item(shape, i)));
     this.#mark();
     if (shapes.length === 0) return;
+    const canvases = [...this.list.querySelectorAll("canvas")];
     api
       .shapes(
         model,
@@ -80,8 +81,9 @@ export class Shelf {
         "coarse",
       )
       .then(({ shapes: drawn }) => {
-        if (this.#shapes !== shapes || this.store.model !== model) return;
-        this.list.querySelectorAll("canvas").forEach((canvas, i) => this.pictures.draw(canvas, drawn[i]));
+        // A list that is made anew has other canvases; a new name leaves them.
+        if (!canvases[0].isConnected) return;
+        canvases.forEach((canvas, i) => this.pictures.draw(canvas, drawn[i]));
       })
       .catch(report);
   }

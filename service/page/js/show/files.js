@@ -145,7 +145,8 @@ export class Files {
   }
 
   async #picture() {
-    keep(await picture(this.viewer), `${this.store.model.name}.png`);
+    const { name } = this.store.model;
+    keep(await picture(this.viewer), `${name}.png`);
   }
 
   #turntable() {
@@ -175,15 +176,17 @@ export class Files {
   async #video(what, make) {
     if (this.recording) return;
     this.recording = true;
+    const { name } = this.store.model;
     try {
       const isGif = this.video[0].value === "gif"; // which takes another time than it lasts
       const tell = (seconds) =>
         say(isGif ? "Making a GIF …" : `Recording, for ${readable(seconds)} s …`, { key: "video" });
       const { blob, extension } = await make(tell);
-      keep(blob, `${this.store.model.name}-${what}.${extension}`);
+      keep(blob, `${name}-${what}.${extension}`);
       say(isGif ? "The GIF is saved." : "The video is saved.", { key: "video" });
     } catch (error) {
-      say(error.message, { kind: "error", key: "video" });
+      // Otherwise the path has changed.
+      if (error.name !== "AbortError") say(error.message, { kind: "error", key: "video" });
     } finally {
       this.recording = false;
     }
@@ -195,23 +198,25 @@ export class Files {
     for (const button of ["#download-animation", "#film"]) find(button).disabled = keyframes.length < 2;
     if (keyframes.length < 2 || this.animation.options.length) return;
     const { links } = await api.interpolation(model, { keyframes });
+    if (this.animation.options.length) return; // a later answer keeps the user's choice
     const names = Object.keys(links).filter((name) => !["self", "frames"].includes(name));
     this.animation.replaceChildren(...names.map((name) => element("option", { textContent: name })));
   }
 
   async #animation() {
     const { model, fine } = this.store;
+    const { fps, request } = this.path; // before the user may change it
     const name = find("#path-name").value.trim();
     say("The server makes the animation …", { key: "animation" });
     try {
       await this.#animationFormats(); // they are missing if the server did not answer
       const format = this.animation.value;
       const { links } = await api.interpolation(model, {
-        ...this.path.request,
+        ...request,
         ...(name && { name }),
         mesh: fine ? "fine" : "coarse",
       });
-      const speed = TIMED.includes(format) ? `&fps=${Math.max(this.path.fps, 1)}` : "";
+      const speed = TIMED.includes(format) ? `&fps=${Math.max(fps, 1)}` : "";
       keep(await api.file(links[format] + speed), `${name || `${model.name}-animation`}.${format}`);
       say("The animation is saved.", { key: "animation" });
     } catch (error) {

@@ -103,11 +103,13 @@ function gif(viewer, seconds, show) {
 
 /** Turn the view once around the shape. */
 export async function turntable(viewer, seconds, format) {
-  const { view } = viewer;
+  const { reference, view } = viewer;
+  const same = () => viewer.reference === reference; // another model has its own view
+  const show = (share) => same() && viewer.turn(view, 2 * Math.PI * share);
   try {
-    return await record(viewer, seconds, (share) => viewer.turn(view, 2 * Math.PI * share), format);
+    return await record(viewer, seconds, show, format);
   } finally {
-    viewer.view = view;
+    if (same()) viewer.view = view;
   }
 }
 

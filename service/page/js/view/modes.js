@@ -21,7 +21,7 @@ export class Modes {
     this.store = store;
     this.sliders = sliders;
     this.pictures = pictures;
-    store.on(["model"], () => {
+    store.on(["space"], () => {
       this.#abort.abort();
       this.#regions = [];
       store.set({ motions: keptMotions(store.model) });
