@@ -36,7 +36,7 @@ _SECTIONS = {"Points": "NumberOfPoints", "Polys": "NumberOfPolys", "Strips": "Nu
 _LZMA_MEMORY = 2**27
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Piece:
     """A part of the mesh with its own points."""
 

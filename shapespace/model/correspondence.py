@@ -59,7 +59,7 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
     layouts = _layouts(model)
     bad = np.flatnonzero(~(np.abs(vertices) < np.finfo(np.float32).max).all(axis=1))
     if len(bad):
-        raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
+        raise InvalidMeshError(f"Vertex {bad[0]} has a coordinate that is not a finite number. Give finite positions.")
     faults = []
     for layout in layouts:
         if len(vertices) == layout.count:
@@ -76,15 +76,15 @@ def match(model: Decoder, vertices: FloatArray, faces: IntArray) -> Matched:
             if not len(torn) and not len(more):
                 return Matched(shape, layout.mesh)
             faults.append(
-                f"Face {[*torn, *more][0]} does not meet its neighbours as in the model. Send the faces in the "
+                f"Face {[*torn, *more][0]} does not meet its neighbours as in the model. Give the faces in the "
                 "model's order. Vertices may be split at texture seams, by flat shading, or as in STL."
             )
     if faults:
-        raise InvalidMeshError(f"{faults[0]} Send a mesh with the faces and the vertex order of the model.")
+        raise InvalidMeshError(f"{faults[0]} Give a mesh with the faces and the vertex order of the model.")
     known = " or ".join(f"{layout.count} vertices and {len(layout.faces)} faces" for layout in layouts)
     raise InvalidMeshError(
         f"The mesh has {len(vertices)} vertices and {len(faces)} faces, but those of {model.manifest.name} have "
-        f"{known}. Send a mesh in correspondence: nothing may be merged, split or reordered. For other meshes use fit."
+        f"{known}. Give a mesh in correspondence: nothing may be merged, split or reordered. For other meshes use fit."
     )
 
 

@@ -61,16 +61,16 @@ def require_targets(decoder: Decoder, targets: Sequence[Target], mesh: MeshChoic
     if not targets:
         raise InvalidTargetError("There are no targets. Give at least one.")
     if len(targets) > count:
-        raise InvalidTargetError(f"targets has {len(targets)} entries. Send {count} at most.")
+        raise InvalidTargetError(f"targets has {len(targets)} entries. Give {count} at most.")
     for i, target in enumerate(targets):
         if not 0 <= target.vertex < count:
             raise InvalidTargetError(
                 f"targets[{i}].vertex is {target.vertex}, but the {mesh} mesh has vertices 0 to {count - 1}."
             )
         if np.shape(target.position) != (3,):
-            raise InvalidTargetError(f"targets[{i}].position has another shape than (3,). Send x, y and z.")
+            raise InvalidTargetError(f"targets[{i}].position has another shape than (3,). Give x, y and z.")
         if target.sigma is not None and not 0 < target.sigma < np.inf:
-            raise InvalidTargetError(f"targets[{i}].sigma is {target.sigma:g}. Send a number above 0, or leave it out.")
+            raise InvalidTargetError(f"targets[{i}].sigma is {target.sigma:g}. Give a number above 0, or leave it out.")
 
 
 def edited(
@@ -110,7 +110,7 @@ def edited(
     scale, size = decoder.manifest.scale, decoder.reference.diagonal
     positions = np.array([target.position for target in targets]) / scale
     if not (np.abs(positions) < np.finfo(np.float32).max).all():
-        raise NotFiniteError("A target lies so far away that the numbers overflow. Send finite positions.")
+        raise NotFiniteError("A target lies so far away that the numbers overflow. Give finite positions.")
     sigmas = np.array([SETTINGS.sigma * size if target.sigma is None else target.sigma / scale for target in targets])
     sigmas = np.maximum(sigmas, SETTINGS.least_sigma * size) / size
     fixed = decoder.latents.fixed(options.fixed)
@@ -132,7 +132,7 @@ def edited(
             changes = pulled.derivatives(best.x)[:, : len(targets)]
         except np.linalg.LinAlgError:  # an alignment of vertices that are not finite
             raise NotFiniteError(
-                "Fixed values lie so far outside the bounds that the model's numbers overflow. Send nearer ones."
+                "Fixed values lie so far outside the bounds that the model's numbers overflow. Give nearer ones."
             ) from None
     found = decoder.shape(code, inside, MeshChoice.COARSE, deadline)
     points = pulled.placed(found.vertices / scale)

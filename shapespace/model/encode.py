@@ -119,9 +119,9 @@ class Encoder:
             vertices = decoder.coarse(given.vertices, given.mesh) / decoder.manifest.scale
             target = nric(vertices, decoder.reference.connectivity)
             if not np.isfinite(norm.square(target)):
-                raise NotFiniteError("The mesh is so large that the numbers overflow. Send it in the model's units.")
+                raise NotFiniteError("The mesh is so large that the numbers overflow. Give it in the model's units.")
         if not target.any():
-            raise InvalidMeshError("The mesh is a single point: no edge has a length. Send a surface.")
+            raise InvalidMeshError("The mesh is a single point: no edge has a length. Give a surface.")
         self._require_size(vertices)
         fixed = latents.fixed(options.fixed)
         nearby = decoder.nearby(given.mesh)
@@ -205,7 +205,7 @@ class Encoder:
         times = _extent(vertices) / _extent(self._decoder.reference.vertices)
         if not 1 / UNITS <= times <= UNITS:
             raise InvalidMeshError(
-                f"The mesh is about {times:.3g} times as large as the training shapes. Send it in the units of the "
+                f"The mesh is about {times:.3g} times as large as the training shapes. Give it in the units of the "
                 "training meshes."
             )
 

@@ -215,6 +215,6 @@ def far_from_all(distance: float, mean: float) -> EncodeFault | None:
         return None
     sentence = (
         f"The nearest shape of the model lies {mean:.1%} of the diagonal away on average: the mesh is another kind of "
-        "shape, or it is stretched or flattened. Send a mesh like those that the model was trained on."
+        "shape, or it is stretched or flattened. Give a mesh like those that the model was trained on."
     )
     return EncodeFault(EncodeCause.FAR, sentence, np.zeros(0, np.int64))

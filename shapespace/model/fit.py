@@ -151,7 +151,7 @@ class _Fit:
         if not 1 / (SETTINGS.units_of_part if self.options.partial else SETTINGS.units) <= ratio <= SETTINGS.units:
             raise InvalidScanError(
                 f"The scan is about {ratio:.3g} times as large as the shapes of {self.decoder.manifest.name}. "
-                f"Send scale=free, or multiply its coordinates by about {1 / ratio:.3g}."
+                f"Set scale=free, or multiply its coordinates by about {1 / ratio:.3g}."
             )
 
     def _search(
@@ -176,7 +176,7 @@ class _Fit:
                 starts.append(StartPlacement(k, placement, float(np.linalg.norm(placement(own) - constraints.places))))
         if not starts:
             raise InvalidScanError(
-                "All landmarks lie at one place, so the size is unknown. Send landmarks at "
+                "All landmarks lie at one place, so the size is unknown. Give landmarks at "
                 "different places, or scale=fixed."
             )
         return sorted(starts, key=lambda start: start.score)[: effort.count]
@@ -370,14 +370,14 @@ class _Fit:
         shares = f"{explained:.0%} of the scan lie at the model, {seen:.0%} of the model at the scan"
         if self.ended or shape.diagnostics.status is Status.DEADLINE:
             status = FitStatus.DEADLINE
-            reason = f"The time ended before the fit converged: {shares} so far. Send fewer points or a coarser scan."
+            reason = f"The time ended before the fit converged: {shares} so far. Give fewer points or a coarser scan."
         elif self._is_poor(explained, seen):
             status = FitStatus.POOR
             reason = f"Only {shares}: the scan is not a shape of this model, or the search failed."
             if mirrored is not None and mirrored < SETTINGS.mirrored:
                 reason += " Its mirror image fits much better: change the sign of one coordinate."
             elif not self.constraints.partial:
-                reason += " Send partial=true if it shows a part only, or three landmarks."
+                reason += " Set partial=true if it shows a part only, or give three landmarks."
         elif rival is not None:
             status = FitStatus.AMBIGUOUS
             apart = self._apart(rival, state)

@@ -50,7 +50,7 @@ class FitConstraints:
         if options.noise is not None and not 0 < options.noise < float(np.finfo(np.float32).max):
             raise InvalidScanError("noise must be a positive number, the standard deviation in the scan's units.")
         if len(options.landmarks) > LANDMARKS:
-            raise InvalidScanError(f"There are {len(options.landmarks)} landmarks. Send {LANDMARKS} at most.")
+            raise InvalidScanError(f"There are {len(options.landmarks)} landmarks. Give {LANDMARKS} at most.")
         for i, landmark in enumerate(options.landmarks):
             _require_landmark(i, landmark, len(decoder.mesh(MeshChoice.FINE).vertices))
         boxed = options.distribution is Prior.BOX

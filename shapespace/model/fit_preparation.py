@@ -108,5 +108,5 @@ class FitPreparation:
             raw = np.stack([rough(code) for code in codes])
         finite = np.isfinite(raw).all(axis=(1, 2))
         if not finite.any():
-            raise InvalidScanError("No shape has the fixed coordinates. Send values nearer to the bounds.")
+            raise InvalidScanError("No shape has the fixed coordinates. Give values nearer to the bounds.")
         return StartShapes(codes[finite], self.decoder.placed(raw[finite], MeshChoice.COARSE))

@@ -83,7 +83,7 @@ class Doubt:
         names = f"{', '.join(most)} and {last}" if most else last
         return (
             f"the scan says little about {names}: another shape, {self.away:.1%} of the diagonal away on average, may "
-            "fit as well. Scan the other sides too, or send landmarks or fixed coordinates."
+            "fit as well. Scan the other sides too, or give landmarks or fixed coordinates."
         )
 
 

@@ -114,14 +114,14 @@ class LatentSpace:
                 names = f" ({'; '.join(self.names)})" if self.dimension <= 12 else ""
                 raise WrongLengthError(
                     f"Code {i} has {len(value)} numbers, but {self.model} takes {self.dimension}{names}. "
-                    f"Send exactly {self.dimension}."
+                    f"Give exactly {self.dimension}."
                 )
         with np.errstate(over="ignore"):
             x = np.array(values, dtype=np.float64).reshape(-1, self.dimension).astype(np.float32)
         bad = np.argwhere(~np.isfinite(x))
         if len(bad):
             raise NotFiniteError(
-                f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Send finite numbers."
+                f"Coordinate {bad[0, 1]} of code {bad[0, 0]} is not a finite number. Give finite numbers."
             )
         if self.periodic.any():
             x = self._remainder(x.astype(np.float64)).astype(np.float32)
@@ -156,7 +156,7 @@ class LatentSpace:
         with np.errstate(over="ignore"):
             bad = np.flatnonzero(~np.isfinite(code.astype(np.float32)))
         if len(bad):
-            raise InvalidFixedError(f"fixed[{bad[0]}] is not a finite number. Send finite numbers.")
+            raise InvalidFixedError(f"fixed[{bad[0]}] is not a finite number. Give finite numbers.")
         return Fixed(mask, np.where(mask, self.code(code.tolist())[0], np.float32(0)))
 
     def found(self, x: FloatArray, bounds: Bounds, fixed: Fixed) -> CheckedCode:

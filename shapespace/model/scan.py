@@ -115,28 +115,28 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
     one place, or indices of faces are out of range.
     """
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InvalidScanError(f"A scan must be points (N, 3), not {points.shape}. Send x, y and z of each.")
+        raise InvalidScanError(f"A scan must be points (N, 3), not {points.shape}. Give x, y and z of each.")
     if len(points) < FEWEST:
-        raise InvalidScanError(f"The scan has {len(points)} points. Send at least {FEWEST}, better a few thousand.")
+        raise InvalidScanError(f"The scan has {len(points)} points. Give at least {FEWEST}, better a few thousand.")
     bad = np.flatnonzero(~(np.abs(points) < np.finfo(np.float32).max).all(axis=1))
     if len(bad):
-        raise InvalidScanError(f"Point {bad[0]} has a coordinate that is not a finite number. Send finite positions.")
+        raise InvalidScanError(f"Point {bad[0]} has a coordinate that is not a finite number. Give finite positions.")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
         raise InvalidScanError(
             f"The faces name points {faces.min()} to {faces.max()}, but there are {len(points)}, counted from 0."
         )
     if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
-        raise InvalidScanError("The scan is too small for its numbers. Send it in smaller units, such as millimetres.")
+        raise InvalidScanError("The scan is too small for its numbers. Give it in smaller units, such as millimetres.")
     # Strays may lie anywhere. Neither flatness nor the spacing of samples may depend on strays.
     away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     if not np.median(away) > 0:
-        raise InvalidScanError("More than half of the points lie at one place. Send each point once.")
+        raise InvalidScanError("More than half of the points lie at one place. Give each point once.")
     kept = away <= FAR * np.median(away)
     faces = faces[kept[faces].all(axis=1)]
     spread = np.linalg.svd(_thinned(points[kept] - points[kept].mean(axis=0), rng), compute_uv=False)
     if not spread[2] > FLAT * spread[0]:
         raise InvalidScanError(
-            "All points of the scan lie in a plane, so they don't determine a shape. Send points from all of the "
+            "All points of the scan lie in a plane, so they don't determine a shape. Give points from all of the "
             "surface."
         )
     twice_areas = np.linalg.norm(face_normals(points, faces, normalised=False), axis=1)

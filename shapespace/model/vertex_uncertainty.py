@@ -29,10 +29,10 @@ def require_covariance(model: Decoder, covariance: ArrayLike) -> FloatArray:
         raise InvalidCovarianceError(f"covariance must have {m} rows of {m} numbers, as `edit` and `encode` answer it.")
     largest = np.abs(matrix).max()
     if not largest < np.finfo(np.float32).max:
-        raise InvalidCovarianceError("covariance has numbers that are not finite or too large. Send finite ones.")
+        raise InvalidCovarianceError("covariance has numbers that are not finite or too large. Give finite ones.")
     lopsided = np.abs(matrix - matrix.T).max() > ROUNDING * largest
     if lopsided or np.linalg.eigvalsh(matrix).min() < -ROUNDING * largest:
-        raise InvalidCovarianceError("covariance is not symmetric with eigenvalues of at least 0. Send one that is.")
+        raise InvalidCovarianceError("covariance is not symmetric with eigenvalues of at least 0. Give one that is.")
     return matrix
 
 

@@ -102,14 +102,14 @@ def test_an_edit_stays_inside_the_bounds(client: httpx.Client) -> None:
 def test_bad_edits_are_told_what_to_do(client: httpx.Client) -> None:
     target = {"vertex": 0, "position": [0, 0, 0]}
     for change, says in (
-        ({"latent": [0, 0]}, "Send exactly 3"),
+        ({"latent": [0, 0]}, "Give exactly 3"),
         ({"targets": []}, "1 or more entries for targets"),
         ({"targets": [target, target | {"vertex": 512}]}, "targets[1].vertex is 512, but the fine mesh has"),
         ({"targets": [target | {"vertex": 64}], "mesh": "coarse"}, "vertices 0 to 63"),
         ({"targets": [target | {"vertex": -1}]}, "vertex is -1"),
         ({"targets": [target | {"vertex": 0.5}]}, "whole number"),
         ({"targets": [target | {"position": [0, 0]}]}, "3 or more entries"),
-        ({"targets": [target | {"position": [0, 0, 1e300]}]}, "Send finite positions"),
+        ({"targets": [target | {"position": [0, 0, 1e300]}]}, "Give finite positions"),
         ({"targets": [target | {"weight": 2}]}, "Remove 'targets[0].weight'"),
         ({"prior": -1}, "at least 0"),
         ({"prior_kind": "lasso"}, "'groups' or 'ridge'"),

@@ -145,7 +145,7 @@ def test_bounds_are_a_parameter(client: httpx.Client) -> None:
 
 
 def test_its_exceptions_say_what_to_do(inference: triton.InferenceServerClient) -> None:
-    with pytest.raises(InferenceServerException, match=r"\[422\].*Send exactly 3"):
+    with pytest.raises(InferenceServerException, match=r"\[422\].*Give exactly 3"):
         inference.infer("small", [latent(CODES[:, :2])])
     with pytest.raises(InferenceServerException, match=r"\[404\].*There is no model 'large'"):
         inference.infer("large", [latent(CODES)])
@@ -206,7 +206,7 @@ def test_the_client_finds_what_is_in_the_folder_and_what_it_did(tmp_path: Path, 
 
     client.infer("small", [latent(CODES)])
     client.infer("small", [latent(CODES)], model_version="1")
-    with pytest.raises(InferenceServerException, match="Send exactly 3"):
+    with pytest.raises(InferenceServerException, match="Give exactly 3"):
         client.infer("small", [latent(CODES[:, :2])], model_version="1")
     every = client.get_inference_statistics()["model_stats"]
     assert [(model["name"], model["version"]) for model in every] == [("small", "1"), ("small", "2")]

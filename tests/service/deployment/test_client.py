@@ -125,7 +125,7 @@ def test_parameters_are_the_options_of_the_library(parameters: type, options: ty
 
 
 def test_problems_are_exceptions_that_say_what_to_do(shapes: Client) -> None:
-    with pytest.raises(ClientError, match="Send exactly 3") as caught:
+    with pytest.raises(ClientError, match="Give exactly 3") as caught:
         shapes.vertices("small", [[1.0]])
     assert caught.value.status == 422
     assert caught.value.type == "urn:shapespace:problem:wrong-length"

@@ -52,9 +52,9 @@ REQUESTS = {
     "JSON in UTF-16": post(MESH, '{"latent": [0, 0, 0]}'.encode("utf-16"), 400, "malformed-request", "no UTF-8"),
     "no latent": post(MESH, {}, 422, "invalid-request", "Add 'latent'"),
     "latent null": post(MESH, {"latent": None}, 422, "invalid-request", "Send a list for latent"),
-    "code too short": post(MESH, {"latent": [0.1]}, 422, "wrong-length", "Send exactly 3"),
-    "code too long": post(MESH, {"latent": [*OK, 1]}, 422, "wrong-length", "Send exactly 3"),
-    "empty code": post(MESH, {"latent": []}, 422, "wrong-length", "Send exactly 3"),
+    "code too short": post(MESH, {"latent": [0.1]}, 422, "wrong-length", "Give exactly 3"),
+    "code too long": post(MESH, {"latent": [*OK, 1]}, 422, "wrong-length", "Give exactly 3"),
+    "empty code": post(MESH, {"latent": []}, 422, "wrong-length", "Give exactly 3"),
     "NaN": post(MESH, '{"latent": [NaN, 0, 0]}', 422, "not-finite", "finite numbers only: latent[0]"),
     "infinity": post(MESH, '{"latent": [0, -Infinity, 0]}', 422, "not-finite", "finite numbers only: latent[1]"),
     "beyond doubles": post(MESH, '{"latent": [0, 0, 1e999]}', 422, "not-finite", "finite numbers only: latent[2]"),
@@ -69,10 +69,10 @@ REQUESTS = {
         MESH, {"latent": [0.3, 0, 0], "bounds": "reject"}, 422, "out-of-bounds", "or choose clamp or allow for bounds"
     ),
     "text in a link": get(f"{MESH}?latent=a,b,c", 422, "invalid-request", "separated by commas"),
-    "NaN in a link": get(f"{MESH}?latent=nan,0,0", 422, "not-finite", "Send finite numbers"),
-    "short code in a link": get(f"{MESH}?latent=1,2", 422, "wrong-length", "Send exactly 3"),
+    "NaN in a link": get(f"{MESH}?latent=nan,0,0", 422, "not-finite", "Give finite numbers"),
+    "short code in a link": get(f"{MESH}?latent=1,2", 422, "wrong-length", "Give exactly 3"),
     "digits of another kind in a link": get(f"{MESH}?latent=1_0,0,0", 422, "invalid-request", "separated by commas"),
-    "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Send exactly 3"),
+    "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Give exactly 3"),
     "no code": post(VERTICES, {"latents": []}, 422, "invalid-request", "Send at least one code"),
     "one code for many": post(VERTICES, {"latents": OK}, 422, "invalid-request", "Send a list for latents[0]"),
     "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
@@ -125,7 +125,7 @@ REQUESTS = {
     "nothing to colour": get(f"{MESH}?against=0,0,0", 422, "invalid-request", "only for color=stretch"),
     "colours against text": get(f"{MESH}?color=bending&against=x", 422, "invalid-request", "?against=0.1,0.2"),
     "colours against a short code": post(
-        f"{MESH}?color=bending&against=1", {"latent": OK}, 422, "wrong-length", "Send exactly 3"
+        f"{MESH}?color=bending&against=1", {"latent": OK}, 422, "wrong-length", "Give exactly 3"
     ),
     "colours against a code out of bounds": post(
         f"{MESH}?color=bending&against=0.3,0,0", {"latent": OK, "bounds": "reject"}, 422, "out-of-bounds", "Move it"

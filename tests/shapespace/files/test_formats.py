@@ -86,7 +86,7 @@ def test_pickles_are_refused_and_not_run(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match="No such file"):
+    with pytest.raises(MeshError, match="no such file or folder"):
         read_arrays(tmp_path / "none.obj")
 
 

@@ -227,7 +227,7 @@ def test_a_fit_is_ambiguous_where_the_scan_says_little(figure: ShapeModel, plain
     found = figure.fit_scan(scan, partial=True)
     assert found.status is FitStatus.AMBIGUOUS
     assert "the scan says little about left knee:" in found.reason
-    assert "Scan the other sides too, or send landmarks" in found.reason
+    assert "Scan the other sides too, or give landmarks" in found.reason
     # Landmarks on the leg tell where it is.
     told = [Landmark(int(k), given.shape[k].tolist()) for k in np.flatnonzero(leg)[::20]]
     found = figure.fit_scan(scan, partial=True, landmarks=told)

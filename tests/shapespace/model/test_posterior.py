@@ -148,7 +148,7 @@ def test_a_mesh_in_other_units_is_refused_by_how_much(model: ShapeModel) -> None
         (0.28, r"about 0\.[23]"),
         (3.5, "about [34]"),
     ):
-        with pytest.raises(InvalidMeshError, match=f"{said}.* times as large.* Send it in the units of"):
+        with pytest.raises(InvalidMeshError, match=f"{said}.* times as large.* Give it in the units of"):
             model.encode(times * shape)
     assert SCALE != 1, "the units of the files are not those of the networks"
 

@@ -314,7 +314,7 @@ REFUSALS: dict[str, tuple[Callable[[Path], Path | None], str]] = {
     ),
     "dangling link": (
         lambda folder: (write(folder) / "pose3.obj").symlink_to("gone.obj"),
-        r"pose3\.obj: can't be read: No such file",
+        r"pose3\.obj: can't be read: there is no such file",
     ),
     "pickle": (bad_file("pose2.npz", b"\x80\x04]\x94."), r"pose2\.npz: not a readable npz file"),
     "NaN in text": (written(moved(1, 7, [0, np.nan, 0])), r"vertex 8 has a coord.* not finite \(counted from 1"),

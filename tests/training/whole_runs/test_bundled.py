@@ -83,7 +83,7 @@ def test_a_bundle_meets_what_it_promises(name: str) -> None:
 @pytest.mark.parametrize("folder", [*(ROOT / "runs" / name for name in MODELS), RUN_OF_0_1], ids=lambda path: path.name)
 def test_committed_runs_can_be_looked_at(folder: Path, tmp_path: Path, said: Said) -> None:
     run = shutil.copytree(folder, tmp_path / "run")
-    assert "export       to do" in said("status", run)
+    assert "export         to do" in said("status", run)
     assert "report.html" in said("report", run)
 
 

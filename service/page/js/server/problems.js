@@ -36,6 +36,7 @@ export const TEXTS = {
   "invalid-mesh": "Export the file again from the program that made it.",
   "invalid-scan": "Export the scan again, with points from all of the surface.",
   "no-tangent-space": "This model can’t compute exact shapes.",
+  "no-such-range": "The file has no such part. Reload the page and try again.",
   periodic: "This model has angles that go round, so it has no blend shapes.",
   "too-many-codes": "This is more shapes than the server computes at once. Use fewer keyframes.",
   "too-many-frames": "The animation is too long for the server. Use fewer keyframes.",
