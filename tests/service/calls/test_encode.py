@@ -205,7 +205,7 @@ BAD = {
     "a face less": (written("ply", faces=MESH.faces[1:]), "ply", "has 127 faces, but the model's has 128"),
     "inside out": (written("obj", faces=MESH.faces[:, ::-1]), "obj", "turn them, and mirror the mesh too if"),
     "faces out of range": (as_json(MESH.vertices, MESH.faces + 1), "json", "vertices 1 to 64"),
-    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Send the faces in the model's order"),
+    "STL in another order": (written("stl", faces=SHUFFLED), "stl", "Give the faces in the model's order"),
     "a single point": (as_json(0 * MESH.vertices), "json", "no edge has a length"),
     "JSON of numbers": (b"[1, 2, 3]", "json", "not an object"),
     "JSON of text": (b'{"vertices": ["a", "b"]}', "json", "vertices must be"),
