@@ -64,6 +64,7 @@ def test_nothing_can_be_pressed_before_the_model_is_there(window: Open) -> None:
     studio.eventually(lambda: any(studio.code))
 
 
+@pytest.mark.long
 def test_the_picker_and_download_while_the_server_is_away_and_after(window: Open, start: Start, models: Path) -> None:
     port = free_port()
     server = start(models, port=port)

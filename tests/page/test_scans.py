@@ -268,6 +268,7 @@ def test_a_movement_too_small_to_see_is_none_and_a_scan_off_the_shape_is_doubted
     assert little == "9% lie, but the scan says little about a, 0.9% away. If you can, scan more sides."
 
 
+@pytest.mark.long
 def test_a_part_is_fitted_as_a_part(visit: Visit, given: Given) -> None:
     studio = visit(FIGURE)
     front = given.vertices[given.vertices[:, 2] > np.quantile(given.vertices[:, 2], 0.4)]

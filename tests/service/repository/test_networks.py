@@ -60,7 +60,9 @@ def test_they_are_served_where_they_do_no_harm(client: httpx.Client) -> None:
         assert ask(client, model, GOOD).json()["vertices"] == ask(client, "good", GOOD).json()["vertices"]
 
 
-@pytest.mark.parametrize("model", ["loops", "loops-if", "loops-scan"])
+@pytest.mark.parametrize(
+    "model", ["loops", *(pytest.param(name, marks=pytest.mark.long) for name in ("loops-if", "loops-scan"))]
+)
 def test_a_network_that_hangs_is_ended_and_the_others_go_on(client: httpx.Client, server: Server, model: str) -> None:
     answers: list[httpx.Response] = []
     threads = [threading.Thread(target=lambda: answers.append(ask(client, model, HARMFUL))) for _ in range(4)]

@@ -202,10 +202,10 @@ RESULTS = {
 }
 
 
-#: What is missing is treated like what is damaged, and takes as long to make again.
-WHY = pytest.mark.parametrize("why", ["damaged", pytest.param("missing", marks=pytest.mark.long)])
+WHY = pytest.mark.parametrize("why", ["damaged", "missing"])
 
 
+@pytest.mark.long
 @WHY
 def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     why: str, folder: Path, finished: Path, said: Said
@@ -228,6 +228,7 @@ def test_a_finished_run_makes_again_what_is_damaged_or_missing(
     assert "again" not in said("status", finished) + said(*run)
 
 
+@pytest.mark.long
 @WHY
 def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished: Path) -> None:
     models = finished / "models"
@@ -243,6 +244,7 @@ def test_a_bundle_that_is_missing_or_damaged_is_written_again(why: str, finished
     assert contents(bundle) == before
 
 
+@pytest.mark.long
 def test_a_damaged_log_is_no_obstacle(finished: Path, said: Said) -> None:
     (finished / "log.jsonl").write_bytes(b'\xff\xfe{"event": 1}\n[1]\n{"event": "progress"}\n')
     assert "done in" in said("status", finished)

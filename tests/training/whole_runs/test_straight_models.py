@@ -36,7 +36,10 @@ examples = {examples}
 """
 
 
-@pytest.mark.parametrize(("geometry", "examples"), [("vertices", False), ("nric", True), ("differential", False)])
+@pytest.mark.parametrize(
+    ("geometry", "examples"),
+    [pytest.param("vertices", False, marks=pytest.mark.long), ("nric", True), ("differential", False)],
+)
 def test_a_straight_line_model_is_served_without_training(
     blends: tuple[TriangleMesh, np.ndarray], ellipsoid: TriangleMesh, tmp_path: Path, geometry: str, examples: bool
 ) -> None:
