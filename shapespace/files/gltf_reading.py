@@ -27,6 +27,7 @@ from shapespace.files.gltf_document import (
     read_document,
 )
 from shapespace.files.limits import UNLIMITED, Limits, label
+from shapespace.files.polygon_reading import strip_triangles
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Most primitives of a scene, counted at each of their places.
@@ -234,13 +235,11 @@ class PlacedPrimitive:
                 )
         if self.mode == _TRIANGLES:
             faces = corners.reshape(-1, 3)
+        elif self.mode == _STRIP:
+            faces = strip_triangles(corners, np.array([0, len(corners)]))
         else:
-            first = corners[:-2] if self.mode == _STRIP else np.full(len(corners) - 2, corners[0])
-            faces = np.stack([first, corners[1:-1], corners[2:]], axis=1)
-            if self.mode == _STRIP:
-                faces[1::2] = faces[1::2, [0, 2, 1]]
-            # Triangles without area join strips.
-            faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+            faces = np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+            faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]  # without area
         matrices = self.skin.matrices(buffers) if self.skin else self.place
         mirrored = matrices is not None and (np.linalg.det(matrices[..., :3, :3]) < 0).all()
         return faces[:, ::-1] if mirrored else faces

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits, as_utf8, clipped
-from shapespace.files.polygon_reading import Lines, TriangleFans, first_values, reals, whole
+from shapespace.files.polygon_reading import Lines, TriangleFans, first_values, reals, strip_triangles, whole
 from shapespace.mesh.triangle_mesh import MeshError
 
 #: Bytes at the start of a file in which its header has to end.
@@ -121,7 +121,7 @@ def _read(elements: list[PlyElement], table: TextTable | BinaryTable, limits: Li
             corners = chain.from_iterable(
                 (-1, *map(int, strip)) for (strip,) in table.lists(element, [element.corners])
             )
-            strips = strip_triangles(np.fromiter(corners, np.int64))
+            strips = _separated(np.fromiter(corners, np.int64))
             limits.check(0, len(strips))
         else:
             table.skip(element)
@@ -130,17 +130,10 @@ def _read(elements: list[PlyElement], table: TextTable | BinaryTable, limits: Li
     return vertices, faces if len(faces) else strips
 
 
-def strip_triangles(corners: IntArray) -> IntArray:
-    """Return the triangles (F, 3) of strips (n,), which −1 separates; triangles without area join strips."""
-    windows = np.stack([corners[k : max(len(corners) - 2 + k, 0)] for k in range(3)], axis=1)
-    places = np.arange(len(windows))
-    # Every second triangle of a strip is turned over.
-    begins = np.maximum.accumulate(np.where(windows[:, 0] == -1, places + 1, 0))
-    odd = (places - begins) % 2 == 1
-    windows[odd] = windows[odd][:, [0, 2, 1]]
-    kept = (windows != -1).all(axis=1) & (windows != np.roll(windows, 1, axis=1)).all(axis=1)
-    found: IntArray = windows[kept]
-    return found
+def _separated(corners: IntArray) -> IntArray:
+    """Return the triangles (F, 3) of strips (n,), which −1 separates."""
+    sizes = np.diff(np.flatnonzero(np.append(corners, -1) == -1), prepend=-1) - 1
+    return strip_triangles(corners[corners != -1], np.append(0, np.cumsum(sizes)))
 
 
 def open_table(data: memoryview, limits: Limits) -> tuple[list[PlyElement], TextTable | BinaryTable]:

@@ -348,3 +348,19 @@ def _ascii_stl(data: memoryview, limits: Limits) -> FloatArray:
     if len(coordinates) != whole_facets or not _is_whole_stl(part, parts.behind(part)):
         raise EOFError("it ends in the middle of a facet")
     return np.array(coordinates, np.float64).reshape(-1, 3)
+
+
+def strip_triangles(corners: IntArray, offsets: IntArray) -> IntArray:
+    """Return the triangles (F, 3) of strips, which begin at ``offsets`` (n + 1,) in the list of their corners.
+
+    Triangles without area, which join strips, are left out.
+    """
+    sizes = np.diff(offsets)
+    places = np.arange(len(corners)) - np.repeat(offsets[:-1], sizes)
+    faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    # Every second triangle of a strip is turned over.
+    odd = places[:-2] % 2 == 1
+    faces[odd] = faces[odd][:, [0, 2, 1]]
+    inside = (places + 2 < np.repeat(sizes, sizes))[:-2]
+    found: IntArray = faces[inside & (faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    return found

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
-from shapespace.files.polygon_reading import ENDS_EARLY
+from shapespace.files.polygon_reading import ENDS_EARLY, strip_triangles
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import MeshError
 
@@ -37,15 +37,7 @@ class VtkCells(NamedTuple):
         cells = self._chosen(np.diff(self.offsets) >= 3)
         polygons = MeshAttributes(starts=cells.offsets, corners=cells.corners)
         limits.check(0, int((polygons.sizes - 2).sum()))
-        if not self.strips:
-            return polygons.triangles
-        first, second, third = polygons.triangle_corners.T
-        odd = (second - first) % 2 == 0
-        faces: IntArray = cells.corners[
-            np.stack([second - 1, np.where(odd, third, second), np.where(odd, second, third)], axis=1)
-        ]
-        # Triangles without area join strips.
-        return faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+        return strip_triangles(cells.corners, cells.offsets) if self.strips else polygons.triangles
 
     def of_grid(self, types: IntArray) -> tuple[VtkCells, VtkCells]:
         """Return the polygons and the triangle strips among the cells of an unstructured grid, by their types (n,).

@@ -45,7 +45,7 @@ _Numbers = Annotated[list[Number], Field(fail_fast=True)]
 
 
 def _kind(data: object) -> str:
-    """Return which list data is, by its first element, so that a fault is told once and not for every kind."""
+    """Return the tag of data by its first element. So a fault is told once, not for every kind of list."""
     if data is None:
         return "list[none]"
     return "list[list]" if isinstance(data, list) and isinstance(next(iter(data), None), list) else "list[number]"
