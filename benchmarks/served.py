@@ -237,7 +237,9 @@ def finding(shares: dict[str, float]) -> str:
     if better:
         sentences.append(f"Our error is clearly below the error of the best simple model for {said(better)}.")
     if rest:
-        sentences.append(f"It is about as large, or larger, for {said(rest)}." if better else f"None: {said(rest)}.")
+        between = f"{min(rest.values()):.2f} to {max(rest.values()):.2f}"
+        others = f"For the others with a figure in the last column, ours is {between} times as large."
+        sentences.append(others if better else f"None: {said(rest)}.")
     return "\n".join(sentences)
 
 
