@@ -41,8 +41,8 @@ licence = "CC0-1.0"
 "upper right bends" = "thumb"
 ```
 
-The column *value* has the default, then other choices and limits. A setting with only a type, such as *path*, has no
-default. The run refuses unknown settings. The [glossary](glossary.md) explains the words.
+Brackets have the default, then other choices and limits. A setting with only a type, such as *path*, has no default.
+The run refuses unknown settings. The [glossary](glossary.md) explains the words.
 """
 RESEARCH = """\
 ## For research: kinds of networks
@@ -153,8 +153,7 @@ class Page:
         meaning = " ".join((field.description or "").split()).replace("``", "`")
         links = [self._link(model) for model in models_in(field.annotation)]
         meaning = " ".join(filter(None, [meaning, f"See {', '.join(links)}." if links else ""]))
-        cells = (f"`{field.alias or name}`", value(field, shown(default, name, field)), meaning)
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        return f"- **`{field.alias or name}`** ({value(field, shown(default, name, field))}): {meaning}"
 
     def _section(self, model: type[BaseModel]) -> Iterator[str]:
         (path, kind, default), *others = self.places[model]
@@ -163,7 +162,7 @@ class Page:
         yield " ".join((model.__doc__ or "").split()).replace("``", "`")
         yield ""
         if others:
-            yield "These tables have the same settings. Some have other defaults:"
+            yield "Also in these tables, some with other defaults:"
             yield ""
         for place, its_kind, other in others:
             differing = [
@@ -184,7 +183,7 @@ class Page:
                 else:
                     known[first].append(f"`{field.alias or name}`")
         if rows:
-            yield from ("| setting | value | meaning |", "|---|---|---|", *rows, "")
+            yield from (*rows, "")
         if known:
             same = [f"{', '.join(names)} as in {self._link(first)}" for first, names in known.items()]
             yield from (f"Also {'; '.join(same)}.", "")

@@ -53,11 +53,10 @@ class LatentNetworkSettings(SettingsTable):
     fourier: int = Field(1, ge=0)
     """Highest frequency of periodic coordinates among the inputs; 0, as in the paper, takes the angle itself."""
     skip_orders: list[int] = Field([])
-    """For periodic coordinates only: highest frequency of each in a linear layer beside the hidden ones, fitted by
-    ridge regression."""
+    """Highest frequency of each periodic coordinate in a linear layer beside the hidden ones, fitted by ridge
+    regression."""
     skip_degree: int = Field(3, ge=0)
-    """Degree of the polynomials in such a layer without periodic coordinates; 0 for none. It falls to keep them below
-    20,000."""
+    """Degree of the polynomials in such a layer without periodic coordinates; 0 for none. At most 20,000 are used."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges, each with its own principal basis in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
@@ -65,7 +64,7 @@ class LatentNetworkSettings(SettingsTable):
     support: float = Field(1, gt=0, le=1)
     """Share of the variance on the edges in this basis. Below 1 other edges keep their mean, and files get smaller."""
     integrability: float = Field(0, ge=0)
-    """Weight in the loss of lengths and angles that fit no surface. Convolutions need ``crop = 0`` for it."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     eta: float | None = Field(None, gt=0)
     """Weight of angles in the loss. By default lengths and angles get the same variance."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
@@ -129,7 +128,7 @@ class ConvolutionSettings(SettingsTable):
     normalisation: Normalisation = "before"
     """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """Weight in the loss of lengths and angles that fit no surface. Convolutions need ``crop = 0`` for it."""
+    """Weight in the loss of lengths and angles that fit no surface. Needs ``crop = 0``."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
     """How it is trained."""
 
@@ -157,7 +156,7 @@ class DenseSettings(SettingsTable):
     normalisation: Normalisation = "after"
     """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """Weight in the loss of lengths and angles that fit no surface. Convolutions need ``crop = 0`` for it."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     fit: FitSettings = FitSettings(schedule="cosine", max_epochs=60)
     """How it is trained."""
 
@@ -198,7 +197,7 @@ class PaperSettings(SettingsTable):
     normalisation: Normalisation = "before"
     """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """Weight in the loss of lengths and angles that fit no surface. Convolutions need ``crop = 0`` for it."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     fit: FitSettings = FitSettings()
     """How it is trained."""
 
@@ -217,7 +216,7 @@ class AutoSettings(SettingsTable):
 
     kind: Literal["auto"] = "auto"
     minutes: float = Field(30, ge=0)
-    """Most minutes of training for the second kind. The run skips it if the kernel alone took longer."""
+    """Most minutes of training for the second kind, which is skipped if the kernel alone took longer."""
 
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
@@ -291,4 +290,4 @@ class NetworkSettings(Recipe):
     seeds: list[int] = Field([])
     """Not used any more; ``python -m benchmarks.studies`` trains with several seeds now."""
     paper: bool = False
-    """Also train the paper's own system, for comparison. This about doubles the time of the stage."""
+    """Also train the paper's own system, for comparison. The stage takes about twice as long."""

@@ -51,8 +51,8 @@ class CollectionSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
-    """Built-in generator, instead of ``data``. ``expressive`` is a body with hands and face, ``people`` 24 bodies in 14
-    poses each. Both need the extra ``people``."""
+    """Built-in generator, instead of ``data``. ``expressive``, a body with hands and face, and ``people``, 24 bodies in
+    14 poses each, need the extra ``people``."""
     data: Path | None = None
     """Folder of meshes, NPZ file with ``vertices`` (n, V, 3) and ``faces``, or GLB or glTF file with [morph
     targets](files.md#morph-targets-as-a-collection), relative to the configuration's folder."""
@@ -63,8 +63,7 @@ class CollectionSettings(SettingsTable):
     parts: list[str] = []
     """[Parts](files.md#several-parts) to keep, the main part first. By default all, the largest as the main part."""
     coarse_vertices: int = Field(1000, ge=0)
-    """Number of vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with
-    all."""
+    """Vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with all."""
     mirror: bool = True
     """Also learn from [mirror images](glossary.md#mirror-image), if one shape has exactly one plane of symmetry."""
 
@@ -90,8 +89,8 @@ class ExponentialSettings(SettingsTable):
     """The discrete exponential, which makes a shape from a code in K time steps."""
 
     first_step: FirstStep = "centred"
-    """The first of the K steps; it changes what codes mean. ``centred`` costs one more step. With ``paper``, also in
-    runs of version 0.2, the error falls only like 1/K."""
+    """First of the K steps; it changes what codes mean. ``centred`` costs one more step. With ``paper``, also in runs
+    of version 0.2, the error falls only like 1/K."""
 
 
 class ModeSettings(SettingsTable):
@@ -100,8 +99,7 @@ class ModeSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of modes m, less than the number of shapes. ``auto`` minimises the relative error of held-out shapes plus
-    0.5 % for each mode."""
+    """Number of modes m. ``auto`` minimises the relative error of held-out shapes plus 0.5 % for each mode."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
     """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The other maps are
     straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``
@@ -127,7 +125,7 @@ class FactorSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"modes"})
 
     count: int | None = Field(None, ge=1)
-    """Number of factors J. By default the overlap of the modes decides."""
+    """Number of factors; by default the overlap of the modes decides."""
     modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
     """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``, counted from 0, the strongest first. Set
     ``modes.count`` too."""
@@ -151,27 +149,26 @@ class SampleSettings(SettingsTable):
 
     distribution: Distribution = "box"
     """Distribution of random codes. ``box``: uniform within the bounds. ``ball``: uniform in each factor's largest
-    ellipsoid inside the bounds, without the corners, where shapes fold most. ``normal``: normal, truncated at the
-    bounds, two standard deviations from the middle. Periodic coordinates are always uniform."""
+    ellipsoid inside the bounds, without the corners, where shapes fold most. ``normal``: a normal distribution,
+    truncated at the bounds, two standard deviations from the middle."""
     count: int = Field(4000, ge=10)
-    """Number of joint samples, which take most of a run's time. 500 are enough for a first look."""
+    """Joint samples, which take most of a run's time. 500 are enough for a first look."""
     steps: int | None = Field(None, ge=1)
-    """Number K of [time steps](glossary.md#time-steps) of exponentials, ``modes.log_steps`` by default. If that is
-    ``auto`` and the first step centred: the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps is
-    at most 1e-5."""
+    """Number K of [time steps](glossary.md#time-steps) of exponentials. By default ``modes.log_steps``, or with
+    ``auto`` the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps is at most 1e-5."""
     factor_counts: list[int] | int | None = None
     """Samples of each factor alone: one number for all factors, or a list. By default 1000, but at most ``count``."""
     shapes: bool = True
-    """Whether the codes of your own shapes are training samples too, at most a quarter of ``count``."""
+    """Whether networks also learn from the codes of your own shapes, at most a quarter of ``count``."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples with derivatives by the code, each as slow as ten others. They help most if samples are
-    few. By default 60, but at most a tenth of ``count``."""
+    """Joint samples with derivatives by the code, each as slow as ten others. They help most if samples are few. By
+    default 60, but at most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
     """Samples per file. A worker that dies loses the file that it computes."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
-    """Share of the joint samples for the evaluation only."""
+    """Share of joint samples for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Share of the remaining samples that choose the learning rate and the best epoch."""
+    """Share of the other samples that choose learning rate and best epoch."""
     seed: int = 0
     """Seed of the codes and of their split."""
 
@@ -200,13 +197,13 @@ class EvaluationSettings(SettingsTable):
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in all figures."""
     baselines: bool = False
-    """Also train ``monolithic`` and ``monolithic_paper``, networks with one factor. This about doubles the time of the
-    stage ``networks``."""
+    """Also train ``monolithic`` and ``monolithic_paper``, networks with one factor. The stage ``networks`` takes about
+    twice as long."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
-    """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 leaves it out. It may take as long
-    as all samples. Needs ``baselines``."""
+    """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 for none. It may take as long as
+    all samples. Needs ``baselines``."""
     grid_size: int = Field(1000, ge=1)
-    """Most nodes of one factor's grid. A factor with fewer than 3 nodes per coordinate gets none."""
+    """Most nodes of one factor's grid."""
     exact_factors: int = Field(200, ge=2)
     """Test codes for the affine sum of exact factor shapes."""
     reconstructions: int = Field(100, ge=1)
@@ -237,7 +234,7 @@ class ExportSettings(SettingsTable):
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
     """Weight of angles against lengths in [Gauss–Newton](glossary.md#gaussnewton)."""
     examples: bool = True
-    """Whether the model [remembers](glossary.md#remembers) training shapes. Each takes a byte for each length and
+    """Whether the model [remembers](glossary.md#remembers) training shapes. One shape takes a byte for each length and
     angle."""
     decoder: bool = True
     """Whether to write [``decoder.onnx``](bundle.md#the-decoder)."""

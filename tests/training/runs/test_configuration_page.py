@@ -21,7 +21,7 @@ def test_every_setting_is_there_and_described(section: str) -> None:
     text = Page().text()
     for name, facts in SECTIONS[section]["properties"].items():
         ignored = facts.get("description", "").startswith("Not used any more")
-        assert name == "kind" or (f".{name}`" in text if ignored else f"| `{name}` |" in text)
+        assert name == "kind" or (f".{name}`" in text if ignored else f"- **`{name}`** (" in text)
         assert name == "kind" or facts.get("description"), name
 
 
@@ -93,11 +93,11 @@ def test_a_setting_of_several_kinds_has_a_table_for_each(monkeypatch: pytest.Mon
     text = Page().text()
     assert "See [kernel](#networksway-kernel), [plain](#networksway-plain)." in text
     kernel, plain = text.split("### networks.way (kernel)")[1].split("### networks.way (plain)")
-    assert "| `size` | `3`, ≥ 2 |" in kernel
+    assert "- **`size`** (`3`, ≥ 2): " in kernel
     assert "- `networks.other`: `size = 12`" in kernel
     assert "Another way." in plain
     fit = text.split("### networks.fit")[1].split("##")[0]
     assert "- `networks.way.fit` (kernel): `rate = 0.25`\n" in fit
     assert "- `networks.way.fit` (plain)\n- `networks.other.fit`: `rate" in fit
-    assert text.count("| `fit` | table | See") == 1
+    assert text.count("- **`fit`** (table): See") == 1
     assert all("Also `fit` as in [networks](#networks)." in part for part in (kernel, plain))
