@@ -101,7 +101,7 @@ class ModeSettings(SettingsTable):
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m. ``auto`` minimises the relative error of held-out shapes plus 0.5 % for each mode."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
-    """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The other maps are
+    """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The others are
     straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``
     (rotations and stretches of faces) so that they turn far. Straight lines train in minutes, have one factor and dense
     modes, and need no ``norm``, ``sparsity`` or samples. ``auto`` takes the cheapest map whose error on held-out shapes
