@@ -161,19 +161,6 @@ class Page:
         yield ""
         yield " ".join((model.__doc__ or "").split()).replace("``", "`")
         yield ""
-        if others:
-            yield "Also in these tables, some with other defaults:"
-            yield ""
-        for place, its_kind, other in others:
-            differing = [
-                f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
-                for name, field in model.model_fields.items()
-                if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
-            ]
-            also = f"- `{place}`" + (f" ({its_kind})" if its_kind else "")
-            yield also + (f": {', '.join(differing)}" if differing else "")
-        if others:
-            yield ""
         rows, known = [], defaultdict(list)
         for name, field in model.model_fields.items():
             if f"{path}.{name}" not in IGNORED and not (kind and name == "kind"):
@@ -187,6 +174,19 @@ class Page:
         if known:
             same = [f"{', '.join(names)} as in {self._link(first)}" for first, names in known.items()]
             yield from (f"Also {'; '.join(same)}.", "")
+        if others:
+            yield "These tables have the same settings, some with other defaults:"
+            yield ""
+        for place, its_kind, other in others:
+            differing = [
+                f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
+                for name, field in model.model_fields.items()
+                if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
+            ]
+            also = f"- `{place}`" + (f" ({its_kind})" if its_kind else "")
+            yield also + (f": {', '.join(differing)}" if differing else "")
+        if others:
+            yield ""
 
     def text(self) -> str:
         """Return the text of the page."""

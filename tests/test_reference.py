@@ -21,9 +21,9 @@ def page(name: str) -> str:
 
 
 def first_cells(text: str) -> set[str]:
-    """All text in backquotes in the first columns of the tables."""
-    rows = re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE)
-    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    """All text in backquotes in the first columns of tables, and before the colons of lists."""
+    rows = re.findall(r"^(?:\| (`[^|]*) \||- (`[^:]*`)[^:`]*: )", text, re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", "".join(row))}
 
 
 def test_every_member_and_array_of_a_bundle() -> None:
@@ -43,7 +43,7 @@ def test_every_file_of_a_run_directory() -> None:
     ]
     files += [run.stamp("STAGE"), run.factor_samples(0), run.network("NAME")]
     names = {str(getattr(file, "path", file)).removeprefix("RUN/").replace("factor-0", "factor-J") for file in files}
-    table = page("run-directory").split("| file | holds |")[1].split("\n## ")[0]
+    table = page("run-directory").split("\n## ")[0]
     assert {name.rstrip("/") for name in first_cells(table)} == names
 
 
