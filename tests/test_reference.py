@@ -90,9 +90,9 @@ DIALECTS = {
 }
 
 
-def test_every_format_that_is_read_has_a_row_and_a_test_of_its_dialects() -> None:
-    table = page("files").split("## Dialects that are read")[1]
-    rows = re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)
+def test_every_format_that_is_read_has_an_item_and_a_test_of_its_dialects() -> None:
+    items = page("files").split("## Dialects that are read")[1]
+    rows = re.findall(r"^- ([^:]+):", items, re.MULTILINE)
     assert {name.lower() for row in rows for name in re.findall("[A-Z]{3}", row)} >= DIALECTS.keys()
     assert SCAN_FORMATS.keys() - {"gltf"} == DIALECTS.keys()
     for names in DIALECTS.values():
