@@ -2,6 +2,7 @@
 
 import json
 import types
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -40,19 +41,18 @@ licence = "CC0-1.0"
 "upper right bends" = "thumb"
 ```
 
-The run refuses unknown settings. A dotted heading such as `networks.factors` is a table `[networks.factors]`. Words
-such as *mode* and *factor* are in the [glossary](glossary.md).
+Brackets have the default, then other choices and limits. A setting with only a type, such as *path*, has no default.
+The run refuses unknown settings. The [glossary](glossary.md) explains the words.
 """
 RESEARCH = """\
 ## For research: kinds of networks
 
-These settings make the variants on the [pages of measurements](../measurements/results.md), among them the paper's own
-networks.
+Settings of the variants on the [pages of measurements](../measurements/results.md).
 """
 NO_EFFECT = """\
 ## Settings of version 0.2 that have no effect
 
-The run reads and ignores {}. `python -m benchmarks.studies` trains such variants now.
+{}. `python -m benchmarks.studies` trains such variants now.
 """
 NAMES = {int: "whole number", float: "number", str: "text", bool: "`true` or `false`", Path: "path"}
 
@@ -65,11 +65,12 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def limits(metadata: list[Any]) -> Iterator[str]:
-    """Yield the limits of a value, in words."""
+    """Yield the limits of a value, in words: not that a number of things is no negative number."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     for constraint in [other for each in metadata for other in getattr(each, "metadata", [each])]:
         for name, sign in signs.items():
-            if (bound := getattr(constraint, name, None)) is not None:
+            bound = getattr(constraint, name, None)
+            if bound is not None and f"{sign} {bound}" not in ("> 0", "≥ 0", "≥ 1"):
                 yield f"{sign} {bound:,}"
         if pattern := getattr(constraint, "pattern", None):
             yield f"matches `{pattern}`"
@@ -81,7 +82,7 @@ def words(annotation: Any) -> str:
     """Return a type in words."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Literal:
-        return " or ".join(f"`{json.dumps(value)}`" for value in parts)
+        return ", ".join(f"`{json.dumps(value)}`" for value in parts)
     if origin is Annotated:
         return ", ".join([words(parts[0]), *limits(list(parts[1:]))])
     if origin in (Union, types.UnionType):
@@ -97,11 +98,19 @@ def words(annotation: Any) -> str:
     return "table" if models_in(annotation) else NAMES[annotation]
 
 
-def value(default: Any) -> str:
-    """Return a default as TOML."""
-    if default is None:
-        return "left out"
-    return "" if isinstance(default, BaseModel) or default == {} else f"`{json.dumps(default)}`"
+def value(field: FieldInfo, default: Any) -> str:
+    """Return the default of a setting as TOML, and what else the setting may have."""
+    annotation, bounds = field.annotation, list(limits(field.metadata))
+    kind = words(annotation)
+    if default is PydanticUndefined:
+        return ", ".join(["required", *bounds])
+    if default is None or isinstance(default, BaseModel) or default == {}:
+        return ", ".join([f"one of {kind}" if kind.startswith("`") else kind, *bounds])
+    text = f"`{json.dumps(float(default) if annotation is float else default)}`"
+    if get_origin(annotation) in (Union, types.UnionType):
+        return " or ".join([text, *(other for other in map(words, get_args(annotation)) if other != text)])
+    choices = kind.split(", ") if get_origin(annotation) is Literal or default == [] else kind.split(", ")[1:]
+    return ", ".join([text, *(choice for choice in choices if choice != text), *bounds])
 
 
 def shown(default: BaseModel | None, name: str, field: FieldInfo) -> Any:
@@ -116,6 +125,8 @@ class Page:
         #: The tables of each model: path, kind (or empty), and default.
         self.places: dict[type[BaseModel], list[tuple[str, str, BaseModel | None]]] = {}
         self._visit(Config, "", "", None)
+        #: The first model with each row: other models refer to it.
+        self.rows: dict[str, type[BaseModel]] = {}
 
     def _visit(self, model: type[BaseModel], path: str, kind: str, default: BaseModel | None) -> None:
         self.places.setdefault(model, []).append((path, kind, default))
@@ -134,18 +145,15 @@ class Page:
         place, kind, _ = self.places[model][0]
         return f"{place} ({kind})" if kind else place
 
+    def _link(self, model: type[BaseModel]) -> str:
+        place, kind, _ = self.places[model][0]
+        return f"[{kind or place}](#{self._anchor(model).translate(str.maketrans(' ', '-', '.(),')).lower()})"
+
     def _row(self, name: str, field: FieldInfo, default: BaseModel | None) -> str:
-        here = shown(default, name, field)
-        text = "required" if here is PydanticUndefined else value(here)
-        kind = ", ".join([words(field.annotation), *limits(field.metadata)])
         meaning = " ".join((field.description or "").split()).replace("``", "`")
-        links = [
-            f"[{self._anchor(model)}](#{self._anchor(model).translate(str.maketrans(' ', '-', '.(),')).lower()})"
-            for model in models_in(field.annotation)
-        ]
+        links = [self._link(model) for model in models_in(field.annotation)]
         meaning = " ".join(filter(None, [meaning, f"See {', '.join(links)}." if links else ""]))
-        cells = (f"`{field.alias or name}`", kind, text, meaning)
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        return f"- **`{field.alias or name}`** ({value(field, shown(default, name, field))}): {meaning}"
 
     def _section(self, model: type[BaseModel]) -> Iterator[str]:
         (path, kind, default), *others = self.places[model]
@@ -153,22 +161,32 @@ class Page:
         yield ""
         yield " ".join((model.__doc__ or "").split()).replace("``", "`")
         yield ""
+        rows, known = [], defaultdict(list)
+        for name, field in model.model_fields.items():
+            if f"{path}.{name}" not in IGNORED and not (kind and name == "kind"):
+                row = self._row(name, field, default)
+                if (first := self.rows.setdefault(row, model)) is model:
+                    rows.append(row)
+                else:
+                    known[first].append(f"`{field.alias or name}`")
+        if rows:
+            yield from (*rows, "")
+        if known:
+            same = [f"{', '.join(names)} as in {self._link(first)}" for first, names in known.items()]
+            yield from (f"Also {'; '.join(same)}.", "")
+        if others:
+            yield "These tables have the same settings, some with other defaults:"
+            yield ""
         for place, its_kind, other in others:
             differing = [
                 f"`{field.alias or name} = {json.dumps(getattr(other, name))}`"
                 for name, field in model.model_fields.items()
                 if other and not models_in(field.annotation) and getattr(other, name) != shown(default, name, field)
             ]
-            also = f"- also as `{place}`" + (f" ({its_kind})" if its_kind else "")
-            yield also + (f", where the defaults are {', '.join(differing)}" if differing else "")
+            also = f"- `{place}`" + (f" ({its_kind})" if its_kind else "")
+            yield also + (f": {', '.join(differing)}" if differing else "")
         if others:
             yield ""
-        rows = []
-        for name, field in model.model_fields.items():
-            if f"{path}.{name}" not in IGNORED and not (kind and name == "kind"):
-                rows.append(self._row(name, field, default))
-        if rows:
-            yield from ("| setting | type | default | meaning |", "|---|---|---|---|", *rows, "")
 
     def text(self) -> str:
         """Return the text of the page."""

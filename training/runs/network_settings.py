@@ -15,16 +15,16 @@ Normalisation = Literal["before", "after", "none"]
 
 
 class FitSettings(SettingsTable):
-    """How a network is trained by gradient descent."""
+    """Training of a network by gradient descent."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"weight_decay"})
 
     optimiser: Literal["adam", "muon"] = "adam"
-    """``adam``, as in the paper, or ``muon``: orthogonalised momentum for matrices, which needs fewer steps with large
+    """``adam``, as in the paper, or ``muon``: orthogonalised momentum for matrices, with fewer steps for large
     batches."""
     schedule: Literal["plateau", "cosine"] = "plateau"
-    """Course of the learning rate. ``plateau`` divides it by ten after ``patience`` epochs without progress, as in the
-    paper. ``cosine`` lets it fall to zero over ``max_epochs``, and needs fewer epochs."""
+    """``cosine`` lets the learning rate fall to zero over ``max_epochs``. ``plateau``, as in the paper, divides it by
+    ten after ``patience`` epochs without progress, and needs more epochs."""
     learning_rate: float = Field(1e-3, gt=0)
     """Initial learning rate."""
     weight_decay: float = Field(0, ge=0)
@@ -36,15 +36,13 @@ class FitSettings(SettingsTable):
     max_epochs: int = Field(500, ge=1)
     """Most passes over the training samples."""
     batch_size: int = Field(64, ge=2)
-    """Number of samples per step."""
+    """Samples per step."""
     minutes: float | None = Field(None, gt=0)
-    """Most minutes of training. The first epoch's time decides how many epochs fit."""
+    """Most minutes of training."""
 
 
 class LatentNetworkSettings(SettingsTable):
-    """A network from codes to NRIC. ``monolithic`` is this network with one factor, ``monolithic_paper`` the
-    paper's.
-    """
+    """A network from codes to NRIC."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"normalisation", "eta"})
 
@@ -53,21 +51,20 @@ class LatentNetworkSettings(SettingsTable):
     normalisation: Normalisation = "before"
     """Batch normalisation before or after the activation of each hidden layer."""
     fourier: int = Field(1, ge=0)
-    """Highest frequency of periodic coordinates among the inputs. 0 takes the angle itself, as in the paper."""
+    """Highest frequency of periodic coordinates among the inputs; 0, as in the paper, takes the angle itself."""
     skip_orders: list[int] = Field([])
-    """Highest frequency of each coordinate in a linear layer beside the hidden ones, fitted by ridge regression. Empty
-    for none. All coordinates must be periodic."""
+    """Highest frequency of each periodic coordinate in a linear layer beside the hidden ones, fitted by ridge
+    regression."""
     skip_degree: int = Field(3, ge=0)
-    """Degree of the polynomials in such a layer without periodic coordinates; 0 for none. It is lowered to stay within
-    20,000 polynomials."""
+    """Degree of the polynomials in such a layer without periodic coordinates; 0 for none. At most 20,000 are used."""
     patches: int = Field(1, ge=1)
     """Groups of neighbouring edges, each with its own principal basis in the last layer."""
     energy: float = Field(0.9999, gt=0, le=1)
-    """Share of the variance that this basis keeps. With 1 the last layer is dense, as in the paper."""
+    """Share of the variance that this basis keeps. With 1, as in the paper, the last layer is dense."""
     support: float = Field(1, gt=0, le=1)
     """Share of the variance on the edges in this basis. Below 1 other edges keep their mean, and files get smaller."""
     integrability: float = Field(0, ge=0)
-    """Weight of lengths and angles that fit no surface, in gradient descent."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     eta: float | None = Field(None, gt=0)
     """Weight of angles in the loss. By default lengths and angles get the same variance."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, max_epochs=60)
@@ -118,11 +115,10 @@ class ConvolutionSettings(SettingsTable):
     """Further inputs of a convolution. ``star``, as in the paper: the sum over all edges at the edge's ends. ``flaps``:
     the edges of its two faces, each with its own weights."""
     crop: int = Field(0, ge=0)
-    """Edges in the loss of a training step: a connected part, chosen where the affine sum is bad. 0 takes whole shapes.
-    Needs ``neighbourhood = "flaps"``."""
+    """Edges in the loss of a training step: a connected part, chosen where the affine sum is bad; 0 takes all. Needs
+    ``neighbourhood = "flaps"``."""
     residual: bool = True
-    """Whether layers learn differences from their input, and the network from the affine sum. If not, it learns the
-    joint shape, as in the paper."""
+    """Learn the difference from the affine sum. ``false``, as in the paper, learns the joint shape."""
     edge_channels: int = Field(4, ge=0)
     """Learned constants for each edge, as further inputs."""
     products: int = Field(0, ge=0)
@@ -130,9 +126,9 @@ class ConvolutionSettings(SettingsTable):
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of features set to zero in training."""
     normalisation: Normalisation = "before"
-    """Batch normalisation before or after the activation of each layer."""
+    """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """As in the factor networks. Needs ``crop = 0``."""
+    """Weight in the loss of lengths and angles that fit no surface. Needs ``crop = 0``."""
     fit: FitSettings = FitSettings(schedule="cosine", learning_rate=2e-3, batch_size=16, max_epochs=12)
     """How it is trained."""
 
@@ -148,26 +144,26 @@ class ConvolutionSettings(SettingsTable):
 
 
 class DenseSettings(SettingsTable):
-    """A fully connected, and so large, network on the shapes of all factors (section 3 of the paper)."""
+    """A fully connected, large network on the shapes of all factors (section 3 of the paper)."""
 
     kind: Literal["dense"] = "dense"
     hidden: list[Annotated[int, Field(ge=1)]] = Field([256, 256])
     """Width of each hidden layer."""
     residual: bool = True
-    """Whether it learns the difference from the affine sum, or the joint shape."""
+    """Learn the difference from the affine sum. ``false``, as in the paper, learns the joint shape."""
     dropout: float = Field(0.0, ge=0, lt=1)
     """Share of features set to zero in training."""
     normalisation: Normalisation = "after"
     """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """As in the factor networks."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     fit: FitSettings = FitSettings(schedule="cosine", max_epochs=60)
     """How it is trained."""
 
 
 class FieldSettings(SettingsTable):
-    """A perceptron at every edge. Its inputs are angles to the features that codes move over the surface. Only the
-    collection ``freaky-torus`` has such features.
+    """A perceptron at every edge, for the collection ``freaky-torus`` only. Its inputs are angles to the features that
+    codes move over the surface.
     """
 
     kind: Literal["field"] = "field"
@@ -179,10 +175,9 @@ class FieldSettings(SettingsTable):
     """Concentrations κ of the inputs exp(κ (cos r − 1)), where r is the angle to a feature. Narrow features need large
     values."""
     relative: bool = True
-    """Whether inputs depend only on angles to features, so that symmetries need no learning. If not, inputs are
-    positions."""
+    """Whether inputs depend only on angles to features, or else on positions."""
     edges: int = Field(128, ge=1)
-    """Edges of each shape in the loss of a training step. Half are drawn where the affine sum is bad."""
+    """Edges of each shape in the loss of a training step, half of them where the affine sum is bad."""
     fit: FitSettings = FitSettings(
         optimiser="muon", schedule="cosine", learning_rate=2e-2, batch_size=64, max_epochs=80
     )
@@ -200,9 +195,9 @@ class PaperSettings(SettingsTable):
     width: int = Field(24, ge=1)
     """Features of each edge after each layer."""
     normalisation: Normalisation = "before"
-    """Batch normalisation before or, as in the paper, after the activation of each layer."""
+    """Batch normalisation before or after the activation of each hidden layer."""
     integrability: float = Field(0, ge=0)
-    """As in the factor networks; the paper suggests it."""
+    """Weight in the loss of lengths and angles that fit no surface."""
     fit: FitSettings = FitSettings()
     """How it is trained."""
 
@@ -214,14 +209,14 @@ class PaperSettings(SettingsTable):
 
 
 class AutoSettings(SettingsTable):
-    """``kernel`` for most collections. If codes move something over the surface, the run also tries ``field`` for
-    ``freaky-torus``, otherwise ``convolutions``. It takes this second kind if its error on held-out codes is at least a
-    tenth smaller.
+    """``kernel`` for most collections. If codes move something over the surface, also ``field`` for ``freaky-torus``,
+    otherwise ``convolutions``. The run takes this second kind if its error on held-out codes is at least a tenth
+    smaller.
     """
 
     kind: Literal["auto"] = "auto"
     minutes: float = Field(30, ge=0)
-    """Most minutes of training for the second kind. The run skips it if the kernel alone took longer."""
+    """Most minutes of training for the second kind, which is skipped if the kernel alone took longer."""
 
 
 #: All kinds of corrections; ``auto`` and ``paper`` stand for one of them.
@@ -247,11 +242,11 @@ class CombinerSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"eta"})
 
     correction: CorrectionSettings = AutoSettings()
-    """How the difference from the affine sum is learned."""
+    """A table with ``kind``, by default ``"auto"``, and the settings of this kind."""
     symmetries: bool = True
-    """Whether samples include their images under the collection's symmetries, if it has any."""
+    """Add images of the samples under the collection's symmetries, if it has any."""
     eta: float | None = Field(None, gt=0)
-    """Weight of angles in the loss, as in the factor networks."""
+    """Weight of angles in the loss. By default lengths and angles get the same variance."""
 
     @model_validator(mode="before")
     @classmethod
@@ -277,8 +272,7 @@ class Recipe(SettingsTable):
     combiner: CombinerSettings = CombinerSettings()
     """The network that joins the factors' shapes."""
     fine_tuning: FitSettings | None = None
-    """How all networks are then trained together on the joint samples. By default not. Parts of a combiner in closed
-    form stay."""
+    """Train all networks together afterwards. Parts of a combiner in closed form stay."""
 
 
 class NetworkSettings(Recipe):
@@ -287,14 +281,13 @@ class NetworkSettings(Recipe):
     SINCE_0_3: ClassVar[frozenset[str]] = Recipe.SINCE_0_3 | {"device"}
 
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Where gradient descent runs: processor, NVIDIA or AMD GPU (``cuda``), or GPU of an Apple computer (``mps``).
-    ``auto`` takes [a GPU](../how-to/gpu.md) if there is one. A change of it alone keeps finished networks."""
+    """Processor, NVIDIA or AMD GPU (``cuda``), or Apple GPU (``mps``) for gradient descent. ``auto`` takes [a
+    GPU](../how-to/gpu.md) if there is one. Changing only this keeps finished networks."""
     seed: int = 0
     """Seed of initial weights and of the order of samples."""
     fractions: list[Annotated[float, Field(gt=0, lt=1)]] = Field([])
-    """Not used any more. Version 0.2 trained with these shares of the training codes too; ``python -m
-    benchmarks.studies`` does so now."""
+    """Not used any more; ``python -m benchmarks.studies`` trains with shares of the training codes now."""
     seeds: list[int] = Field([])
-    """Not used any more. Version 0.2 trained with these seeds too; ``python -m benchmarks.studies`` does so now."""
+    """Not used any more; ``python -m benchmarks.studies`` trains with several seeds now."""
     paper: bool = False
-    """Whether to train the paper's own system too, for comparison. It about doubles the time of this stage."""
+    """Also train the paper's own system, for comparison. The stage takes about twice as long."""

@@ -46,31 +46,26 @@ class SettingsTable(BaseModel):
 
 
 class CollectionSettings(SettingsTable):
-    """Where the shapes come from: a built-in generator, or meshes in correspondence."""
+    """The shapes: a built-in generator, or meshes in correspondence."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
-    """Built-in generator, instead of ``data``. ``expressive`` is a body: 100 poses of hands and face, 49 of limbs.
-    ``people`` is 24 bodies in 14 poses each. Both need the extra ``people``."""
+    """Built-in generator, instead of ``data``. ``expressive``, a body with hands and face, and ``people``, 24 bodies in
+    14 poses each, need the extra ``people``."""
     data: Path | None = None
     """Folder of meshes, NPZ file with ``vertices`` (n, V, 3) and ``faces``, or GLB or glTF file with [morph
-    targets](files.md#morph-targets-as-a-collection). The path is relative to the configuration's folder. ``--data``
-    overrides it."""
+    targets](files.md#morph-targets-as-a-collection), relative to the configuration's folder."""
     file: str | None = None
-    """File to read from each folder in ``data``, if every subject has a folder: ``surf/pial.ply`` or ``*_mesh.ply``.
-    Shapes get the folders' names."""
+    """File to read from each folder in ``data``, if every subject has a folder: ``surf/pial.ply`` or ``*_mesh.ply``."""
     reference: str | None = None
-    """Name of the [reference](glossary.md#reference). By default the most central mesh."""
+    """Name of the [reference](glossary.md#reference); by default the most central mesh."""
     parts: list[str] = []
-    """[Parts](files.md#several-parts) to keep, the main part first. By default all, with the largest as the main part.
-    ``run --until ingest`` prints their names."""
+    """[Parts](files.md#several-parts) to keep, the main part first. By default all, the largest as the main part."""
     coarse_vertices: int = Field(1000, ge=0)
-    """Number of vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with
-    all."""
+    """Vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with all."""
     mirror: bool = True
-    """Whether to learn from [mirror images](glossary.md#mirror-image) too, if one of the shapes has exactly one plane
-    of symmetry."""
+    """Also learn from [mirror images](glossary.md#mirror-image), if one shape has exactly one plane of symmetry."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:
@@ -80,62 +75,60 @@ class CollectionSettings(SettingsTable):
 
 
 class MaterialSettings(SettingsTable):
-    """Elastic parameters of the surface, a thin shell. The reference is scaled to area 1."""
+    """Elastic parameters of the surface, a thin shell of area 1."""
 
     mu: float = Field(Material.mu, gt=0)
     """Lamé's μ of the membrane."""
     lambda_: float = Field(Material.lambda_, ge=0, alias="lambda")
     """Lamé's λ of the membrane."""
     eta: float = Field(Material.eta, gt=0)
-    """Weight η of bending against stretching, about the squared thickness of the shell. Triangles may collapse if it is
-    large."""
+    """Weight η of bending, about the squared thickness of the shell. Triangles may collapse if it is large."""
 
 
 class ExponentialSettings(SettingsTable):
     """The discrete exponential, which makes a shape from a code in K time steps."""
 
     first_step: FirstStep = "centred"
-    """The first of the K steps; codes mean other shapes with each. ``centred`` costs one more step. With ``paper`` the
-    error falls only like 1/K. Runs of version 0.2 keep ``paper``."""
+    """First of the K steps; it changes what codes mean. ``centred`` costs one more step. With ``paper``, also in runs
+    of version 0.2, the error falls only like 1/K."""
 
 
 class ModeSettings(SettingsTable):
-    """The modes: the directions in which shapes differ from their mean."""
+    """The directions in which shapes differ from their mean."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"geometry"})
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of modes m, less than the number of shapes. ``auto`` minimises the relative error of held-out shapes plus
-    0.5 % for each mode."""
+    """Number of modes m. ``auto`` minimises the relative error of held-out shapes plus 0.5 % for each mode."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
-    """The map from codes to shapes; ``init`` writes ``auto``. Straight lines: ``vertices`` like blend shapes, ``nric``
-    (lengths and angles) so that limbs bend, ``differential`` (rotations and stretches of faces) so that they turn far.
-    They take minutes, have dense modes and one factor, and need neither ``norm``, ``sparsity`` nor samples.
-    ``exponential`` bends an elastic shell. ``auto`` takes the cheapest map whose error on held-out shapes is at most 2
-    % above the least, or 5 % above exponentials."""
+    """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The others are
+    straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``
+    (rotations and stretches of faces) so that they turn far. Straight lines train in minutes, have one factor and dense
+    modes, and need no ``norm``, ``sparsity`` or samples. ``auto`` takes the cheapest map whose error on held-out shapes
+    is at most 2 % above the least, or 5 % above exponentials."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """Norm in which modes approximate shapes. ``vertices``: distances, weighted by area. ``shell``: the metric of the
     shell space, with much weight on wrinkles. ``mixed``: ``vertices`` plus a tenth of ``shell``."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
-    """Weight λ of sparsity, as a share of the weight at which modes vanish. Larger values make each mode move a smaller
-    part. ``auto`` takes the largest candidate that raises the error of held-out shapes by at most 2 %, or else 0."""
+    """Weight λ of sparsity, as a share of the weight at which modes vanish. Larger values make modes more local.
+    ``auto`` takes the largest that raises the error of held-out shapes by at most 2 %, or else 0."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number K of [time steps](glossary.md#time-steps) of logarithms. ``auto`` takes 8 (16 with the paper's first
-    step). It takes 1 if held-out shapes get no worse and at most a tenth of random shapes fold."""
+    step), or 1 if held-out shapes get no worse and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
     """Most iterations over all modes."""
 
 
 class FactorSettings(SettingsTable):
-    """The factors: groups of modes that move the same part of the surface."""
+    """Groups of modes that move the same part of the surface."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"modes"})
 
     count: int | None = Field(None, ge=1)
-    """Number of factors J. By default the overlap of the modes decides."""
+    """Number of factors; by default the overlap of the modes decides."""
     modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
-    """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``. Modes are counted from 0, the strongest
-    first, each in exactly one factor. Set ``modes.count`` too."""
+    """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``, counted from 0, the strongest first. Set
+    ``modes.count`` too."""
 
     @model_validator(mode="after")
     def _each_mode_once(self) -> FactorSettings:
@@ -155,31 +148,29 @@ class SampleSettings(SettingsTable):
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"distribution"})
 
     distribution: Distribution = "box"
-    """How random codes are drawn. ``box``: uniform within the bounds. ``ball``: uniform in each factor's largest
-    ellipsoid inside the bounds, so without the corners, where shapes fold most. ``normal``: normal, truncated at the
-    bounds, which lie two standard deviations from the middle. Periodic coordinates are always uniform."""
+    """Distribution of random codes. ``box``: uniform within the bounds. ``ball``: uniform in each factor's largest
+    ellipsoid inside the bounds, without the corners, where shapes fold most. ``normal``: a normal distribution,
+    truncated at the bounds, two standard deviations from the middle."""
     count: int = Field(4000, ge=10)
-    """Number of joint samples, which take most of a run's time. 500 are enough for a first look."""
+    """Joint samples, which take most of a run's time. 500 are enough for a first look."""
     steps: int | None = Field(None, ge=1)
-    """Number K of [time steps](glossary.md#time-steps) of exponentials, ``modes.log_steps`` by default. If that is
-    ``auto`` and the first step is centred: the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps
-    is at most 1e-5."""
+    """Number K of [time steps](glossary.md#time-steps) of exponentials. By default ``modes.log_steps``, or with
+    ``auto`` the smallest of 8, 12, 16, 24 and 32 whose error 1 − R² against many steps is at most 1e-5."""
     factor_counts: list[int] | int | None = None
-    """Number of samples of each factor alone: one for all factors, or a list. By default 1000, but at most
-    ``count``."""
+    """Samples of each factor alone: one number for all factors, or a list. By default 1000, but at most ``count``."""
     shapes: bool = True
-    """Whether the codes of the collection's own shapes are training samples too, at most a quarter of ``count``."""
+    """Whether networks also learn from the codes of your own shapes, at most a quarter of ``count``."""
     derivatives: int | None = Field(None, ge=0)
-    """Number of joint samples with derivatives by the code. Each takes as long as about ten others, and helps more if
-    there are only a few hundred. By default 60, but at most a tenth of ``count``."""
+    """Joint samples with derivatives by the code, each as slow as ten others. They help most if samples are few. By
+    default 60, but at most a tenth of ``count``."""
     part_size: int = Field(50, ge=1)
-    """Samples per file. A worker computes one file at a time, and loses it if it dies."""
+    """Samples per file. A worker that dies loses the file that it computes."""
     test_fraction: float = Field(0.2, gt=0, lt=1)
-    """Share of the joint samples for the evaluation only."""
+    """Share of joint samples for the evaluation only."""
     validation_fraction: float = Field(0.1, gt=0, lt=1)
-    """Share of the remaining samples that choose the learning rate and the best epoch."""
+    """Share of the other samples that choose learning rate and best epoch."""
     seed: int = 0
-    """Seed of the random codes and of their split."""
+    """Seed of the codes and of their split."""
 
     @property
     def differentiated(self) -> int:
@@ -199,26 +190,26 @@ def _grid(nodes: int) -> int:
 
 
 class EvaluationSettings(SettingsTable):
-    """How the model is measured on the test samples."""
+    """Measurements on the test samples."""
 
     SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"baselines"})
 
     eta: float = Field(1e-2, gt=0)
     """Weight of angles against lengths in all figures."""
     baselines: bool = False
-    """Whether to train ``monolithic`` and ``monolithic_paper`` too, networks with one factor. This about doubles the
-    time of the stage ``networks``."""
+    """Also train ``monolithic`` and ``monolithic_paper``, networks with one factor. The stage ``networks`` takes about
+    twice as long."""
     grid_nodes: Annotated[int, Field(ge=0), AfterValidator(_grid)] = 0
-    """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 leaves it out. It may take as long
-    as all samples. Needs ``baselines``."""
+    """Most nodes per coordinate of the grid of Sassen et al. 2020, for comparison; 0 for none. It may take as long as
+    all samples. Needs ``baselines``."""
     grid_size: int = Field(1000, ge=1)
-    """Most nodes of one factor's grid. A factor with fewer than 3 nodes per coordinate gets none."""
+    """Most nodes of one factor's grid."""
     exact_factors: int = Field(200, ge=2)
-    """Number of test codes for the affine sum of exact factor shapes."""
+    """Test codes for the affine sum of exact factor shapes."""
     reconstructions: int = Field(100, ge=1)
-    """Number of test shapes whose vertices are reconstructed."""
+    """Test shapes whose vertices are reconstructed."""
     fresh: int = Field(100, ge=0)
-    """Number of [fresh codes](glossary.md#fresh-codes), at most the number of test codes; 0 for none."""
+    """[Fresh codes](glossary.md#fresh-codes), at most as many as test codes; 0 for none."""
 
 
 #: An axis of the collection's coordinates, with its direction.
@@ -233,30 +224,30 @@ class ExportSettings(SettingsTable):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)
     """Name in addresses and file names."""
     version: int = Field(1, ge=1, lt=10**9)
-    """The bundle is written to ``models/NAME/VERSION``, and replaces one with this version."""
+    """Version. The bundle replaces one at ``models/NAME/VERSION``."""
     title: str
     """Title for people."""
     description: str
     """A sentence for people."""
     licence: str
-    """Licence of the meshes, and so of the model."""
+    """Licence of the meshes and the model."""
     eta_reconstruction: float = Field(DEFAULT_ETA, gt=0)
     """Weight of angles against lengths in [Gauss–Newton](glossary.md#gaussnewton)."""
     examples: bool = True
-    """Whether the model [remembers](glossary.md#remembers) training shapes. Each takes a byte for each of its lengths
-    and angles."""
+    """Whether the model [remembers](glossary.md#remembers) training shapes. One shape takes a byte for each length and
+    angle."""
     decoder: bool = True
-    """Whether to write [``decoder.onnx``](bundle.md#the-decoder) for other programs."""
+    """Whether to write [``decoder.onnx``](bundle.md#the-decoder)."""
     tolerance: float = Field(1e-4, gt=0)
     """Largest relative difference between the ONNX and the PyTorch networks."""
     faces: Axis | None = None
-    """The axis along which the body looks: left and right in names are then its own. By default they are a viewer's
-    with x to the right, y up and z towards the eye."""
+    """Axis along which the body looks, so that left and right in names are its own. By default they are a viewer's with
+    x to the right, y up and z towards the eye."""
     up: Axis = "+y"
-    """The axis that points to the body's head. Needs ``faces``."""
+    """Axis that points to the body's head. Needs ``faces``."""
     names: dict[str, str] = {}
-    """New names by the name in the report: ``{"upper right bends" = "left arm"}``. Coordinates follow their factor
-    unless they have names of their own here."""
+    """New names for the names in the report: ``{"upper right bends" = "left arm"}``. Coordinates follow their
+    factor."""
 
     @property
     def key(self) -> dict[str, Any]:

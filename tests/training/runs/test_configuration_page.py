@@ -6,7 +6,7 @@ import pytest
 from pydantic import BaseModel, Field
 
 from scripts import configuration
-from scripts.configuration import TARGET, Page, words
+from scripts.configuration import TARGET, Page, value, words
 from shapespace.training.runs.config import Config
 
 SECTIONS = Config.model_json_schema()["$defs"]
@@ -21,15 +21,15 @@ def test_every_setting_is_there_and_described(section: str) -> None:
     text = Page().text()
     for name, facts in SECTIONS[section]["properties"].items():
         ignored = facts.get("description", "").startswith("Not used any more")
-        assert name == "kind" or (f".{name}`" in text if ignored else f"| `{name}` |" in text)
+        assert name == "kind" or (f".{name}`" in text if ignored else f"- **`{name}`** (" in text)
         assert name == "kind" or facts.get("description"), name
 
 
 def test_types_and_bounds_in_words() -> None:
     assert words(list[float] | int | None) == "list of numbers or whole number"
-    assert words(Literal["a", "b"]) == '`"a"` or `"b"`'
+    assert words(Literal["a", "b"]) == '`"a"`, `"b"`'
     fractions = Config.model_fields["networks"].annotation.model_fields["fractions"]
-    assert words(fractions.annotation) == "list of numbers, > 0, < 1"
+    assert words(fractions.annotation) == "list of numbers, < 1"
 
 
 class Fit(BaseModel):
@@ -42,8 +42,29 @@ class Kernel(BaseModel):
     """One way."""
 
     kind: Literal["kernel"] = "kernel"
-    size: int = Field(12, ge=1)
+    size: int = Field(12, ge=2)
     fit: Fit = Fit(rate=0.25)
+
+
+class Choice(BaseModel):
+    """Values."""
+
+    size: int | Literal["auto"] = "auto"
+    fraction: float = Field(0, ge=0, lt=1)
+    way: Literal["up", "down"] | None = None
+    parts: list[str] = []
+    title: str
+
+
+def test_values_begin_with_their_default() -> None:
+    fields = Choice.model_fields.values()
+    assert [value(field, field.get_default()) for field in fields] == [
+        '`"auto"` or whole number',
+        "`0.0`, < 1",
+        'one of `"up"`, `"down"`',
+        "`[]`, list of text",
+        "required",
+    ]
 
 
 class Plain(BaseModel):
@@ -70,11 +91,13 @@ class Whole(BaseModel):
 def test_a_setting_of_several_kinds_has_a_table_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(configuration, "Config", Whole)
     text = Page().text()
-    assert "See [networks.way (kernel)](#networksway-kernel), [networks.way (plain)](#networksway-plain)." in text
+    assert "See [kernel](#networksway-kernel), [plain](#networksway-plain)." in text
     kernel, plain = text.split("### networks.way (kernel)")[1].split("### networks.way (plain)")
-    assert "| `size` | whole number, ≥ 1 | `3` |" in kernel
-    assert "- also as `networks.other`, where the defaults are `size = 12`" in kernel
+    assert "- **`size`** (`3`, ≥ 2): " in kernel
+    assert "- `networks.other`: `size = 12`" in kernel
     assert "Another way." in plain
     fit = text.split("### networks.fit")[1].split("##")[0]
-    assert "- also as `networks.way.fit` (kernel), where the defaults are `rate = 0.25`\n" in fit
-    assert "- also as `networks.way.fit` (plain)\n- also as `networks.other.fit`, where" in fit
+    assert "- `networks.way.fit` (kernel): `rate = 0.25`\n" in fit
+    assert "- `networks.way.fit` (plain)\n- `networks.other.fit`: `rate" in fit
+    assert text.count("- **`fit`** (table): See") == 1
+    assert all("Also `fit` as in [networks](#networks)." in part for part in (kernel, plain))
