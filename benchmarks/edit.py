@@ -44,8 +44,8 @@ move {mean} mm on average, {most} mm in the worst pull.
 - **target is missed by**: a share of the pull, as median / largest.
 - **factors that change**: by more than 1 % of their bounds, as a mean.
 
-There are {count} pulls by {pull} m from random codes. A change of one [factor](../reference/glossary.md#factor) can reach
-each target. `python -m benchmarks.edit` measures and writes this page.
+There are {count} pulls by {pull} m from random codes. A change of one [factor](../reference/glossary.md#factor) can
+reach each target. `python -m benchmarks.edit` measures and writes this page.
 
 ## Errors and times
 

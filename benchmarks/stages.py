@@ -59,7 +59,7 @@ Times are [CPU time](../reference/glossary.md#cpu-time), without the time to sta
   The defaults are 4000 and 1000.
 - Meshes of more than 20,000 vertices are first thinned by many collapses at once.
 
-{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on
+{people}The collections are capsules that bend and bulge. `python -m benchmarks.stages` trains on
 them with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
 """
 
@@ -210,7 +210,7 @@ def write_page() -> None:
         joint=JOINT,
         factors=OF_FACTORS,
         measured=pages.measured_with(FIGURES),
-        table=table(("", "time", "memory", *(f"of which `{stage}`" for stage in COLUMNS)), rows),
+        table=table(("", "time", "memory", *(f"time of `{stage}`" for stage in COLUMNS)), rows),
     )
     pages.write("growth", page)
 

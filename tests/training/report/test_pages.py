@@ -113,5 +113,5 @@ def test_draws_of_as_many_shapes_are_one_row_of_their_means() -> None:
     ]
     assert few_shapes.simplest(found["hand", 5]) == ("components", pytest.approx(0.05))
     said = few_shapes.finding(found)
-    assert "hand 75 %" in said, "from 0.04 to 0.01 with one doubling"
-    assert "hand 0.50" in said
+    assert "75 % (hand)" in said, "from 0.04 to 0.01 with one doubling"
+    assert "0.50 (hand)" in said
