@@ -36,8 +36,8 @@ runs them, see [errors on unseen shapes](served.md). Errors are mean distances o
 
 ## Modes and principal components
 
-With all modes, the error is {gain} of the error of as many principal components for {better}. For the
-others it is {rest}.
+The error is {gain} of the error of as many principal components for {better}. For the others
+it is {rest} ([with half of the modes](../../benchmarks/NOTES.md#unseen-shapes-with-half-of-the-modes)).
 
 {plain}
 
@@ -71,7 +71,7 @@ The ratio is to components with images. Coarse meshes differ from the first tabl
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with such folds in view.
 - For makehuman the ratios are upper bounds: the exponential ends where faces collapse. [Networks](served.md) still
   give a shape, which is nearer.
-- `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles,
+- `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures
   are in `runs/folds/`.
 """
 PEOPLE_PAGE = """## An unseen pose, an unseen body
@@ -232,14 +232,11 @@ def simple_rows(name: str, found: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-def rows(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[list[str]]:
-    """Return the rows of a collection: modes beside components, for each number of modes; the ratio is to the first."""
-    result: list[list[str]] = []
-    each = zip(found["counts"], found["modes"], *(found[other] for other in others), strict=True)
-    for count, own, *components in each:
-        errors = [f"{100 * some['mean']:.3f} %" for some in (own, *components)]
-        result.append([f"{name}, {count} modes", *errors, f"{own['mean'] / components[0]['mean']:.2f}"])
-    return result
+def row(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[str]:
+    """Return the row of a collection: all modes beside components; the ratio is to the first of these."""
+    errors = [found[kind][-1]["mean"] for kind in ("modes", *others)]
+    shown = (f"{100 * error:.3f} %" for error in errors)
+    return [f"{name}, {found['counts'][-1]} modes", *shown, f"{errors[0] / errors[1]:.2f}"]
 
 
 def between(ratios: Collection[float]) -> str:
@@ -286,15 +283,15 @@ def write_page() -> None:
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in done)),
         simple=pages.table(
             ("", "modes", *SIMPLE.values()),
-            (row for name, found in simple.items() for row in simple_rows(name, found)),
+            (cells for name, found in simple.items() for cells in simple_rows(name, found)),
         ),
         plain=pages.table(
             ("", "error of modes", "of components", "ratio"),
-            (row for name, found in plain.items() for row in rows(name, found, ("components",))),
+            (row(name, found, ("components",)) for name, found in plain.items()),
         ),
         mirrored=pages.table(
             ("", "error of modes", "of components with images", "of components without", "ratio"),
-            (row for name, found in images.items() for row in rows(name, found, ("mirrored_components", "components"))),
+            (row(name, found, ("mirrored_components", "components")) for name, found in images.items()),
         ),
         steps=LIGHT_STEPS,
     )
