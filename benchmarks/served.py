@@ -289,12 +289,13 @@ def write_page() -> None:
         tables["unseen"].append([title, maps, average(unseen), ratio(unseen), ""])
         if best := best_simple(unseen):
             shares[title] = best[1]
-            rivals[SIMPLE.get(best[0], best[0])] += 1
             tables["unseen"][-1][-1] = f"{shares[title]:.2f}"
-            others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
-            tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
         if name.endswith(HALF):
             continue
+        if best:
+            rivals[SIMPLE.get(best[0], best[0])] += 1
+            others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
+            tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
         drawn = " / ".join(f"{100 * figure:.2f}" for figure in found[0]["specificity"])
         tables["known"].append(
             [title, *(average(known, model, ("mean",)) for model in (None, "components", WITHOUT_EXAMPLES)), drawn]
