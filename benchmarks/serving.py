@@ -322,15 +322,14 @@ def growth(count: int) -> None:
                 sums.append(median["sum"])
                 largest = max(largest, resident(os.getpid()))
                 size = str(model.manifest.vertices if kind == "V" else latents)
-                solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
-                found.append([size, ms(median["network"]), solved, ms(median["sum"])])
+                found.append([size, ms(median["sum"]), f"{steps:.1f}"])
             if kind == "V":
                 print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.")
                 print("The number m of modes makes almost no difference.\n")
-                print(table((kind, "networks", "reconstruction (steps)", "sum"), found))
+                print(table((kind, "time", "steps of [Gauss–Newton](../reference/glossary.md#gaussnewton)"), found))
                 print()
             power = np.polyfit(np.log(sizes), np.log(sums), 1)[0]
-            print(f"From {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
+            print(f"From {kind} = {sizes[0]} to {sizes[-1]}, the time grows like {kind}^{power:.2f}.")
     print(f"The shapes are synthetic capsules. The process took at most {largest:.0f} MB, for the largest V.")
 
 
