@@ -40,12 +40,10 @@ PAGE = """# How many shapes do you need?
 
 {table}
 
-- *Our error* is the mean distance of a vertex from its place, in percent of the
-  [diagonal](../reference/glossary.md#diagonal), for {unseen} shapes that no model has seen.
-- *To components*: our error as a share of the error of as many
-  [principal components](../reference/glossary.md#principal-component).
-- *To the best*: as a share of the error of the best of [four simple models](generalisation.md#stronger-simple-models).
-  Above 1, this simple model is nearer.
+Each cell has our mean [vertex error](../reference/glossary.md#vertex-error) for {unseen} unseen shapes, in percent of
+the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of as many [principal
+components](../reference/glossary.md#principal-component), and to the error of the best of [four simple
+models](generalisation.md#stronger-simple-models). {largest}
 
 ## What to do with few shapes
 
@@ -162,20 +160,22 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
 def write_page() -> None:
     """Write the page and its chart from the stored figures."""
     found = means(pages.read_figures(FIGURES))
-    cells = []
-    for (name, count), row in found.items():
-        _, error = simplest(row)
-        cells.append((
-            f"{name}, {count}, {' – '.join(map(str, sorted({row['counts'][0], row['counts'][-1]})))}",
-            f"{100 * row['modes']:.3f}",
-            f"{row['modes'] / row['components']:.2f}",
-            f"{row['modes'] / error:.2f}",
-        ))  # fmt: skip
+
+    def cell(row: dict[str, Any]) -> str:
+        ratios = (row["modes"] / error for error in (row["components"], simplest(row)[1]))
+        return f"{100 * row['modes']:.3f} ({', '.join(f'{ratio:.2f}' for ratio in ratios)})"
+
+    *counts, most = DRAWS
+    cells = [
+        [name, *(cell(found[name, count]) if (name, count) in found else "" for count in counts)] for name in NAMES
+    ]
+    largest = [f"With {most} shapes, {name} has {cell(row)}." for (name, count), row in found.items() if count == most]
     draw_chart(found, pages.MEASUREMENTS / "few-shapes.svg")
     draws = ", ".join(f"{count} shapes {'once' if times == 1 else f'{times} times'}" for count, times in DRAWS.items())
     page = PAGE.format(
         finding=finding(found),
-        table=table(("collection, shapes, modes", "our error", "to components", "to the best"), cells),
+        table=table(("", *(f"{count} shapes" for count in counts)), cells),
+        largest=" ".join(largest),
         unseen=UNSEEN,
         draws=draws,
         measured=pages.measured_with(FIGURES),

@@ -109,7 +109,6 @@ class TrainingTime:
     """Size of a training run, and the minutes that it took."""
 
     title: str
-    shapes: int
     vertices: int
     computed: int  # exact shapes that the networks learn from
     minutes: float
@@ -123,16 +122,14 @@ def times(runs: Path = RUNS) -> list[TrainingTime]:
         counts, ingest = run["drawn"], run["ingest"]
         computed = counts["joint"] + counts["of factors"]
         title = TITLES[name.partition("-")[0]]
-        found.append(
-            TrainingTime(title, ingest["shapes"], ingest["vertices"], computed, sum(run["seconds"].values()) / 60)
-        )
+        found.append(TrainingTime(title, ingest["vertices"], computed, sum(run["seconds"].values()) / 60))
     log = [json.loads(line) for line in (runs / "figure" / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     ingested = next(line for line in log if line["event"] == "ingested")
     # Later calls of the same run repeat single stages.
     seconds = {line["stage"]: line["seconds"] for line in reversed(log) if line["event"] == "end"}
     computed = json.loads((runs / "figure" / "evaluation.json").read_text(encoding="utf-8"))["exponentials"]
     minutes = sum(seconds.values()) / 60
-    found.append(TrainingTime(TITLES["figure"], ingested["shapes"], ingested["vertices"], computed, minutes))
+    found.append(TrainingTime(TITLES["figure"], ingested["vertices"], computed, minutes))
     return sorted(found, key=lambda run: run.minutes)
 
 
