@@ -80,8 +80,8 @@ alone](generalisation.md#stronger-simple-models) explains the simple models.
 
 ## Training shapes and random shapes
 
-Users get their own shapes back almost exactly, which comes from the memory. Random shapes are about as near to training
-shapes as random shapes of components.
+Users get their own shapes back almost exactly, which comes from the memory. Random shapes of both models have similar
+distances from the training shapes.
 
 {known}
 
