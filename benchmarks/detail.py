@@ -25,20 +25,19 @@ from shapespace.training.runs.directory import RunDirectory
 
 PAGE = """# Fine detail
 
-How much of the fine mesh of your files is left in an answer? A model computes the [coarse
-mesh](../reference/glossary.md#coarse-and-fine-mesh), and fixed weights compute the fine mesh from it.
+How much of your files' fine detail is left in an answer? A model computes the [coarse
+mesh](../reference/glossary.md#coarse-and-fine-mesh), and fixed weights compute the fine mesh from it. The weights cost
+at most 0.02 % of the [diagonal](../reference/glossary.md#diagonal) and keep the roughness.
 
-- The weights cost at most 0.02 % of the [diagonal](../reference/glossary.md#diagonal) and keep the roughness.
-- Answers for unseen shapes are as rough as the files, with two exceptions. **Organs (hippocampi) lose a fifth of their
-  roughness**, and horses gain 7 %.
+Answers for unseen shapes are as rough as the files, with two exceptions. **Organs (hippocampi) lose a fifth of their
+roughness**, and horses gain 7 %.
 
 {table}
 
-Each cell has two errors: the weights alone → the whole answer. For the weights alone, we took the coarse vertices from
-the file of an [unseen shape](../reference/glossary.md#unseen-shape). The whole answer is the shape of the code that
-`encode` finds for the file.
+Arrows go from the weights alone, with coarse vertices from the file of an [unseen
+shape](../reference/glossary.md#unseen-shape), to the whole answer after `encode`.
 
-- **distance**: mean over all vertices after alignment, in percent of the diagonal.
+- **distance**: mean over all vertices, in percent of the diagonal.
 - **normals**: median angle in degrees between the normal of a face and the same normal in the file.
 - **roughness**: median angle between the normals of neighbouring faces, divided by the same angle in the file.
 

@@ -34,20 +34,18 @@ How exact and how fast are `edit` and `encode`, and what else does an edit move?
 If you pull a fingertip, an elbow or a knee of the figure (1.7 m tall), the limb follows. The other limbs and the head
 move {mean} mm on average, {most} mm in the worst pull.
 
-| `prior_kind` | others move (mm) | target is missed by | factors that change | shapes computed |
+| `prior_kind` | others move | target is missed by | factors that change | shapes computed |
 |---|---|---|---|---|
 {rows}
 
-- [**`prior_kind`**](../reference/http.md#edit-move-vertices-to-targets): how a change is spread over the code.
+- [**`prior_kind`**](../reference/http.md#edit-move-vertices-to-targets) says how a change is spread over the code.
   `groups` is the default.
-- **others move**: mean distance over the vertices of the other limbs and the head, as mean / largest of all pulls.
-- **target is missed by**: distance as a share of the pull, as median / largest.
-- **factors that change**: mean number of [factors](../reference/glossary.md#factor) that change by more than 1 % of
-  their bounds.
-- **shapes computed**: by the search, with the first one, as mean / largest.
+- **others move**: in mm, the mean over the vertices of the other limbs and the head, as mean / largest of all pulls.
+- **target is missed by**: a share of the pull, as median / largest.
+- **factors that change**: by more than 1 % of their bounds, as a mean.
 
-There are {count} pulls by {pull} m from random codes. Each target is within reach, because a shape that differs in one
-factor of this limb has it. `python -m benchmarks.edit` measures and writes this page.
+There are {count} pulls by {pull} m from random codes. A change of one [factor](../reference/glossary.md#factor) can
+reach each target. `python -m benchmarks.edit` measures and writes this page.
 
 ## Errors and times
 
@@ -65,9 +63,8 @@ full shapes.
   *largest* is the median error of the worst coordinate.
 - **`edit`** moves 1 to 10 vertices to their places on the shape of another code. The error is the largest distance from
   a target, as a share of the [diagonal](../reference/glossary.md#diagonal).
-- **Targets out of reach** take 44 shapes of the figure and 32 of the torus at the median (12 edits each, November
-  2026). One edit of the torus with five targets took 380.
-- **All 4601 vertices** at once take a second, because at most 32 targets choose the first move.
+- **Targets out of reach** take 44 shapes of the figure and 32 of the torus at the median. One edit took 380.
+- **All 4601 vertices** at once take a second.
 
 `python -m benchmarks.codes --count 200` measured this table with version 0.2, on one thread beside other processes.
 """

@@ -40,26 +40,22 @@ PAGE = """# How many shapes do you need?
 
 {table}
 
-- The error is the mean distance of a vertex from its place, in percent of the
-  [diagonal](../reference/glossary.md#diagonal), for {unseen} shapes that no model has seen.
-- *To components*: our error as a share of the error of as many
-  [principal components](../reference/glossary.md#principal-component).
-- *To the best*: as a share of the error of the best of four simple models: components with and without
-  [memory](../reference/glossary.md#remembers), lines of lengths and angles, and
-  [differential coordinates](generalisation.md#stronger-simple-models). Above 1, this simple model is nearer.
+Each cell has our mean [vertex error](../reference/glossary.md#vertex-error) for {unseen} unseen shapes, in percent of
+the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of as many [principal
+components](../reference/glossary.md#principal-component), and to the error of the best of [four simple
+models](generalisation.md#stronger-simple-models). {largest}
 
 ## What to do with few shapes
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
-- **Add mirror images** where left and right may be exchanged (`collection.mirror`). They double the shapes. This page
-  has none.
+- **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
 - **Expect no details of single shapes.** Five shapes have at most four modes.
 
 ## How it was measured
 
 - Training shapes are drawn at random: {draws}. Figures are means over the draws.
-- Each draw chooses its [map](../explanation/choosing.md#map-from-codes-to-shapes) and its number of modes by itself.
-  The simple models have as many modes, the same coarse meshes, and find codes by vertices.
+- Each draw chooses its [map](../explanation/choosing.md#map-from-codes-to-shapes) and its number of modes by itself
+  (see `runs/few-shapes.json`). The simple models have as many modes and the same coarse meshes.
 - Exponentials are exact here. Networks add an error of their own, see [unseen shapes](served.md).
 - `python -m benchmarks.few_shapes --data FOLDER` measures and writes this page. {measured}
 """
@@ -136,22 +132,26 @@ def draw_chart(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None
 
 
 def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
-    """Say how the error falls with more shapes, and how ours compares where there are ten."""
+    """Say how the error falls with more shapes, and how ours compares where there are ten, as ranges."""
+
+    def between(figures: dict[str, float], form: str) -> str:
+        least, most = (choose(figures, key=lambda name: figures[name]) for choose in (min, max))
+        return f"{form.format(figures[least])} ({least}) to {form.format(figures[most])} ({most})"
+
     falls = {}
     for name in NAMES:
         counts = [key[1] for key in found if key[0] == name]
         if len(counts) > 1:
             first, last = (found[name, count]["modes"] for count in (counts[0], counts[-1]))
             doublings = np.log2(counts[-1] / counts[0])
-            falls[name] = 1 - (last / first) ** (1 / doublings)
-    listed = ", ".join(f"{name} {100 * fall:.0f} %" for name, fall in falls.items())
-    said = f"Twice as many shapes lower the error on unseen shapes by a share that depends on the collection: {listed}."
+            falls[name] = 100 * (1 - (last / first) ** (1 / doublings))
+    said = f"Twice as many shapes lower the error on unseen shapes by {between(falls, '{:.0f} %')}."
     ten = {key[0]: row for key, row in found.items() if key[1] == 10}
     if ten:
-        ratios = ", ".join(f"{name} {row['modes'] / row['components']:.2f}" for name, row in ten.items())
+        ratios = {name: row["modes"] / row["components"] for name, row in ten.items()}
         worst = max(row["modes"] / simplest(row)[1] for row in ten.values())
         said += (
-            f"\n\nWith ten shapes, our error as a share of the error of principal components is: {ratios}."
+            f"\n\nWith ten shapes, our error is {between(ratios, '{:.2f}')} of the error of principal components."
             f"\nIt is at most {worst:.2f} of the error of the best simple model."
         )
     return said
@@ -160,21 +160,22 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
 def write_page() -> None:
     """Write the page and its chart from the stored figures."""
     found = means(pages.read_figures(FIGURES))
-    cells = []
-    for (name, count), row in found.items():
-        best, error = simplest(row)
-        cells.append((
-            f"{name}, {count} shapes, {' – '.join(map(str, sorted({row['counts'][0], row['counts'][-1]})))} modes",
-            ", ".join(row["maps"]),
-            f"{100 * row['modes']:.3f}",
-            f"{row['modes'] / row['components']:.2f}",
-            f"{row['modes'] / error:.2f} ({SIMPLE.get(best, best)})",
-        ))  # fmt: skip
+
+    def cell(row: dict[str, Any]) -> str:
+        ratios = (row["modes"] / error for error in (row["components"], simplest(row)[1]))
+        return f"{100 * row['modes']:.3f} ({', '.join(f'{ratio:.2f}' for ratio in ratios)})"
+
+    *counts, most = DRAWS
+    cells = [
+        [name, *(cell(found[name, count]) if (name, count) in found else "" for count in counts)] for name in NAMES
+    ]
+    largest = [f"With {most} shapes, {name} has {cell(row)}." for (name, count), row in found.items() if count == most]
     draw_chart(found, pages.MEASUREMENTS / "few-shapes.svg")
     draws = ", ".join(f"{count} shapes {'once' if times == 1 else f'{times} times'}" for count, times in DRAWS.items())
     page = PAGE.format(
         finding=finding(found),
-        table=table(("", "map", "our error", "to components", "to the best"), cells),
+        table=table(("", *(f"{count} shapes" for count in counts)), cells),
+        largest=" ".join(largest),
         unseen=UNSEEN,
         draws=draws,
         measured=pages.measured_with(FIGURES),

@@ -31,19 +31,15 @@ PAGE = """# Unseen shapes, by modes alone
 
 How near can modes come to a shape that was not used to find them? Here exact
 [exponentials](../reference/glossary.md#exponential) compute the shapes, on coarse meshes. For models as the server
-runs them, see [errors on unseen shapes](served.md).
-
-Errors are mean distances of vertices in percent of the [diagonal](../reference/glossary.md#diagonal). K is the number
-of [time steps](../reference/glossary.md#time-steps). {measured}
+runs them, see [errors on unseen shapes](served.md). Errors are mean distances of vertices as shares of the
+[diagonal](../reference/glossary.md#diagonal).
 
 ## Modes and principal components
 
-With all modes, the error is {gain} of the error of as many principal components for {better}. For the
-others it is {rest}.
+The error is {gain} of the error of as many principal components for {better}. For the others
+it is {rest} ([with half of the modes](../../benchmarks/NOTES.md#unseen-shapes-with-half-of-the-modes)).
 
 {plain}
-
-Each collection also has a row with half of its modes.
 
 ## Stronger simple models
 
@@ -59,24 +55,23 @@ Each figure is the error as a share of the error of principal components. {colle
 
 ## With mirror images
 
-[Mirror images](../reference/glossary.md#mirror-image) of the training shapes help modes and components alike. On
-posed bodies (makehuman), modes stay better than components.
+[Mirror images](../reference/glossary.md#mirror-image) of the training shapes help modes and components alike.
 
 {mirrored}
 
-The ratio is to components with images. Coarse meshes differ from those in the first table, so compare within a row.
+The ratio is to components with images. Coarse meshes differ from the first table, so compare within a row.
 
 {people}## How it was measured
 
 - Five [folds](../reference/glossary.md#fold) leave each shape out once. Mean, logarithms and modes come from the other
-  shapes. The error is the distance of the nearest exponential after rigid alignment.
-- All models have the same folds, meshes and number of coordinates, and find codes by vertices.
-- Coarse meshes have at most a thousand vertices. K is {steps}, or 1 where a fold chose it.
+  shapes. The error is the distance of the nearest exponential. {measured}
+- All models have the same folds, coarse meshes of at most a thousand vertices, and number of coordinates. Exponentials
+  have {steps} [time steps](../reference/glossary.md#time-steps), or 1 where a fold chose it.
 - No fold chooses by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with such folds in view.
-- For makehuman the ratios are upper bounds: faces collapse on the way to some of its poses, and the exponential ends
-  there. [Networks](served.md) still give a shape, which is nearer.
-- `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures, with 95th percentiles,
+- For makehuman the ratios are upper bounds: the exponential ends where faces collapse. [Networks](served.md) still
+  give a shape, which is nearer.
+- `python -m benchmarks.generalisation --data FOLDER` measures and writes this page. Figures
   are in `runs/folds/`.
 """
 PEOPLE_PAGE = """## An unseen pose, an unseen body
@@ -86,8 +81,8 @@ PEOPLE_PAGE = """## An unseen pose, an unseen body
 {rows}
 
 {bodies} adults stand in {poses} poses each ([generator](../how-to/collections.md#bodies-without-data-of-your-own)
-`people`). A run without every fifth pose, or without every fifth person, chose map and number of modes by itself.
-Poses differ in more ways than {poses} poses can show, so no model comes near to an unseen one.
+`people`). The run without every fifth pose or person chose map and number of modes by itself. Poses differ in more ways
+than {poses} poses can show, so no model comes near to an unseen one.
 
 """
 #: A ratio below this is a clear gain.
@@ -230,23 +225,18 @@ def people_section(found: dict[str, Any]) -> str:
 
 def simple_rows(name: str, found: dict[str, Any]) -> list[list[str]]:
     """Return the rows of a collection: the error of each model as a share of the error of principal components."""
-    title = f"{name}, K = {', '.join(map(str, found['steps']))}"
     return [
-        [f"{title}, {count} modes"]
+        [f"{name}, {count} modes"]
         + [f"{found[kind][k]['mean'] / found['components'][k]['mean']:.2f}" for kind in ("modes", *SIMPLE)]
         for k, count in enumerate(found["counts"])
     ]
 
 
-def rows(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[list[str]]:
-    """Return the rows of a collection: modes beside components, for each number of modes; the ratio is to the first."""
-    result: list[list[str]] = []
-    each = zip(found["counts"], found["modes"], *(found[other] for other in others), strict=True)
-    for count, own, *components in each:
-        title = f"{name}, K = {', '.join(map(str, found['steps']))}"
-        errors = [f"{100 * some['mean']:.3f} %" for some in (own, *components)]
-        result.append([f"{title}, {count} modes", *errors, f"{own['mean'] / components[0]['mean']:.2f}"])
-    return result
+def row(name: str, found: dict[str, Any], others: tuple[str, ...]) -> list[str]:
+    """Return the row of a collection: all modes beside components; the ratio is to the first of these."""
+    errors = [found[kind][-1]["mean"] for kind in ("modes", *others)]
+    shown = (f"{100 * error:.3f} %" for error in errors)
+    return [f"{name}, {found['counts'][-1]} modes", *shown, f"{errors[0] / errors[1]:.2f}"]
 
 
 def between(ratios: Collection[float]) -> str:
@@ -293,15 +283,15 @@ def write_page() -> None:
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in done)),
         simple=pages.table(
             ("", "modes", *SIMPLE.values()),
-            (row for name, found in simple.items() for row in simple_rows(name, found)),
+            (cells for name, found in simple.items() for cells in simple_rows(name, found)),
         ),
         plain=pages.table(
             ("", "error of modes", "of components", "ratio"),
-            (row for name, found in plain.items() for row in rows(name, found, ("components",))),
+            (row(name, found, ("components",)) for name, found in plain.items()),
         ),
         mirrored=pages.table(
             ("", "error of modes", "of components with images", "of components without", "ratio"),
-            (row for name, found in images.items() for row in rows(name, found, ("mirrored_components", "components"))),
+            (row(name, found, ("mirrored_components", "components")) for name, found in images.items()),
         ),
         steps=LIGHT_STEPS,
     )

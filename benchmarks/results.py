@@ -311,15 +311,9 @@ def write_page() -> None:
         missing_shell=[name for name in COLLECTIONS if name + SHELL not in rows],
         spread=spread,
         leading=leading,
-        joint=joint_exponentials,
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in rows)),
         range=max(most - least for _, least, most in (spread(row, "composite") for row in real.values())),
         best=lambda row: max(each["total"] for each in row["evaluation"]["fresh"]["r2"].values()),
-        ablated={
-            name: row["evaluation"]
-            for name, row in real.items()
-            if row["evaluation"]["variants"] and "validation" in row["evaluation"]
-        },
     )
     pages.write("results", page)
 

@@ -8,6 +8,7 @@ fifth, until each fifth was held out once, or ``--folds`` of them. Results are k
 """
 
 import argparse
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -53,9 +54,7 @@ FIGURES = ROOT / "runs" / "collections"
 PAGE = """# Errors on unseen shapes
 
 How near does a model come to a shape that it has never seen? [Is it for my data?](../is-it-for-me.md) has the
-summary. Errors are mean distances of vertices in percent of the [diagonal](../reference/glossary.md#diagonal); after
-the slash stands the 95th percentile. Each collection also has a model with half of its modes. A run chooses its
-[map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. {measured}
+summary. Errors are mean distances of vertices in percent of the [diagonal](../reference/glossary.md#diagonal).
 
 ## Unseen shapes
 
@@ -63,9 +62,11 @@ the slash stands the 95th percentile. Each collection also has a model with half
 
 {unseen}
 
-The [ratio](../reference/glossary.md#ratio) is to as many principal components, with the smallest and the largest
-ratio of a [fold](../reference/glossary.md#fold) in brackets. Then follows our error as a share of the best simple
-model's error. Each fold of makehuman trains on 35 or 36 shapes, which limits its modes.{incomplete}
+- After the slash stands the 95th percentile.
+- The [ratio](../reference/glossary.md#ratio) is to as many principal components. In brackets stand the smallest and the
+  largest ratio of a [fold](../reference/glossary.md#fold).{incomplete}
+- Each run chose its [map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. Each collection has a second
+  model with half of its modes.
 
 ## Simple models
 
@@ -73,32 +74,28 @@ model's error. Each fold of makehuman trains on 35 or 36 shapes, which limits it
 
 {simple}
 
-All figures are errors as shares of the error of principal components, on the same meshes. The first column is our
-model without its [memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`).
+Each figure is the error as a share of the error of principal components. The first column is our model without its
+[memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`). [Modes
+alone](generalisation.md#stronger-simple-models) explains the simple models.
 
-## Training shapes
+## Training shapes and random shapes
 
-Users get their own shapes back almost exactly. This comes from the memory, as the last column shows.
+Users get their own shapes back almost exactly, which comes from the memory. Random shapes of both models have similar
+distances from the training shapes.
 
 {known}
 
-## Random shapes
-
-Smaller is better: random shapes then look more like shapes of the collection.
-
-{first}
-
-The table has the [specificity](../reference/glossary.md#specificity) in percent of the diagonal, of {codes} codes
-drawn evenly from the bounds, in the first fold.
+*Random shapes*: the [specificity](../reference/glossary.md#specificity), ours / of components, for {codes} codes drawn
+evenly from the bounds, in the first fold. A smaller distance is better.
 
 ## How it was measured
 
-- We trained and exported each model five times on four fifths of the shapes, so that each shape was unseen once.
-  Settings come from `examples/collections/`, without mirror images.
+- Each fold trains and exports a model on four fifths of the shapes. Settings come from `examples/collections/`, without
+  mirror images. {measured}
 - Networks learned from at most {joint} [joint](../reference/glossary.md#joint-code) samples and {factors} of each
   factor.
-- `encode` of the exported model got the fine meshes. Simple models come from the fine meshes of the same four fifths.
-  All find codes by vertices.
+- `encode` of the exported model got the fine meshes. Simple models come from the same fine meshes. All find codes by
+  vertices.
 - No fold chose by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with some of them in view.
 - `python -m benchmarks.served --data FOLDER` trains, measures and writes this page. Figures are in
@@ -231,7 +228,7 @@ def finding(shares: dict[str, float]) -> str:
     rest = {name: share for name, share in shares.items() if name not in better}
 
     def said(some: dict[str, float]) -> str:
-        return ", ".join(f"{name} ({share:.2f})" for name, share in some.items())
+        return "; ".join(f"{name} ({share:.2f})" for name, share in some.items())
 
     sentences = []
     if better:
@@ -249,9 +246,12 @@ def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
     for name, found in rows.items():
         if len(found) < FOLDS:
             few.setdefault(len(found), []).append(name)
-    said = [f"\n{', '.join(names)}: only {count} of {FOLDS} folds." for count, names in few.items()]
+    said = [  # one fold has no range
+        f" {'Rows without brackets' if count == 1 else ', '.join(names)} have only {count} of {FOLDS} folds."
+        for count, names in few.items()
+    ]
     if not all("map" in fold for found in rows.values() for fold in found):
-        said.append("\nRows without a last figure are older: exponentials were the only map then.")
+        said.append("\n- Rows without a last figure are older: exponentials were the only map then.")
     return "".join(said)
 
 
@@ -277,9 +277,9 @@ def write_page() -> None:
     """Write the page from all stored figures."""
     files = {name: FIGURES / f"{name}.json" for name in NAMES}
     rows = {name: pages.read_figures(file) for name, file in files.items() if file.exists()}
-    tables: dict[str, list[list[str]]] = {"unseen": [], "simple": [], "known": [], "first": []}
+    tables: dict[str, list[list[str]]] = {"unseen": [], "simple": [], "known": []}
     shares: dict[str, float] = {}
-    rivals: dict[str, list[str]] = {}
+    rivals: Counter[str] = Counter()
     for name, found in rows.items():
         modes = [fold["modes"] for fold in found]
         count = " – ".join(map(str, sorted({min(modes), max(modes)})))
@@ -288,28 +288,31 @@ def write_page() -> None:
         maps = ", ".join(sorted({fold.get("map", "exponential") for fold in found}))
         tables["unseen"].append([title, maps, average(unseen), ratio(unseen), ""])
         if best := best_simple(unseen):
-            rival, shares[title] = SIMPLE.get(best[0], best[0]), best[1]
-            rivals.setdefault(rival, []).append(title)
-            tables["unseen"][-1][-1] = f"{shares[title]:.2f} ({rival})"
-            others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
-            tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
+            shares[title] = best[1]
+            tables["unseen"][-1][-1] = f"{shares[title]:.2f}"
         if name.endswith(HALF):
             continue
-        alone = average(known, WITHOUT_EXAMPLES, ("mean",))
-        tables["known"].append([title, average(known), average(known, "components"), alone])
-        tables["first"].append([title, *(f"{100 * figure:.2f}" for figure in found[0]["specificity"])])
+        if best:
+            rivals[SIMPLE.get(best[0], best[0])] += 1
+            others = [ratio(unseen, kind) if kind in unseen[0] else "" for kind in (WITHOUT_EXAMPLES, *SIMPLE)]
+            tables["simple"].append([title, *(each.partition(" (")[0] for each in others)])
+        drawn = " / ".join(f"{100 * figure:.2f}" for figure in found[0]["specificity"])
+        tables["known"].append(
+            [title, *(average(known, model, ("mean",)) for model in (None, "components", WITHOUT_EXAMPLES)), drawn]
+        )
     heads = {
         "unseen": ("map", "our error", "ratio", "to the best simple model"),
         "simple": ("ours without memory", *SIMPLE.values()),
-        "known": ("our error", "components", "ours without memory"),
-        "first": ("our random shapes", "of components"),
+        "known": ("our error", "of components", "ours without memory", "random shapes"),
     }
     page = PAGE.format(
         joint=JOINT,
         factors=OF_FACTORS,
         codes=RANDOM,
         finding=finding(shares),
-        simplest=" ".join(f"The best simple model is {rival} for {'; '.join(some)}." for rival, some in rivals.items()),
+        simplest="The best simple model is "
+        + ", ".join(f"{rival} in {count} rows" for rival, count in rivals.most_common())
+        + ".",
         incomplete=incomplete(rows),
         measured=pages.measured_with(*(files[name] for name in rows)),
         **{kind: table(("", *heads[kind]), cells) for kind, cells in tables.items()},

@@ -52,15 +52,14 @@ GLB = MESH_FORMATS["glb"].encode
 BANDED = 5000
 PAGE = """# Serving
 
-How long does the server take for a shape, where does the time go, and how does it grow? Times are [CPU
-time](../reference/glossary.md#cpu-time) of one thread in milliseconds, medians over {count} codes, unless a table says
-otherwise.
+How long does the server take for a shape, and how does the time grow? Times are milliseconds of [CPU
+time](../reference/glossary.md#cpu-time) on one thread, as medians over {count} codes, unless a table says otherwise.
 """
 END = """
 ## How it was measured
 
-`python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with version {version}. [The
-notes](../../benchmarks/NOTES.md#performance) say why the server is as fast as it is.
+`python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with version {version}. The
+notes say [why the server is fast](../../benchmarks/NOTES.md#why-the-server-is-fast).
 """
 #: Numbers of codes that a graph takes at once.
 BATCHES = (1, 8, 64)
@@ -149,14 +148,14 @@ def stages(folders: list[Path], count: int) -> None:
         medians[name] = median
         exact.append([name, *to_exact(model, codes)])
         steps = statistics.mean(times["iterations"][3:])
-        p95, p99 = (ms(float(np.quantile(times["sum"][3:], q))) for q in (0.95, 0.99))
+        quantiles = " / ".join(ms(float(np.quantile(times["sum"][3:], q))) for q in (0.5, 0.95, 0.99))
         late[name] = float(np.quantile(times["sum"][3:], 0.95)) / median["sum"]
         if limit := ceiling(model, codes[:5]):
             limits.append(limit / median["sum"])
         solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
         own.append([name, ms(median["network"]), solved, ms(median["encode"]), ms(median["sum"])])
         others = f"{ms(median['full'])} / {ms(median['draft'])}"
-        tails.append([name, p95, p99, others, f"{median['without MKL'] / median['sum']:.2f}"])
+        tails.append([name, quantiles, others, f"{median['without MKL'] / median['sum']:.2f}"])
         shares = " / ".join(f"{median[key] / median['SuperLU']:.2f}" for key in ("sum", "full", "draft"))
         if found := graph(model, codes[3:]):
             batches.append([name, *found])
@@ -164,13 +163,11 @@ def stages(folders: list[Path], count: int) -> None:
         beside.append([name, ms(median["blend shapes"]), ms(limit) if limit else "–", shares, furthest])
     sums, slowest = [each["sum"] for each in medians.values()], max(late, key=lambda name: late[name])
     print("\n## A shape as a file\n")
-    print(f"A shape takes {ms(min(sums))} to {ms(max(sums))} ms, by model. Reconstruction takes most of the time.\n")
-    print(table(("model", "networks", "reconstruction (steps)", "file", "sum"), own))
-    print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. Steps are of")
-    print("[Gauss–Newton](../reference/glossary.md#gaussnewton), as a mean. V is the number of coarse vertices.")
-    print(f"\nOne code in twenty takes up to {late[slowest]:.1f} times as long as the median ({slowest}).\n")
-    print(table(("", "p95 of the sum", "p99", "full / draft", "without MKL"), tails))
-    print("\nThe last column: time without [MKL](../reference/glossary.md#blas-mkl), divided by the sum.")
+    print(f"A shape takes {ms(min(sums))} to {ms(max(sums))} ms, by model. Reconstruction takes most of the time.")
+    print(f"One code in twenty takes up to {late[slowest]:.1f} times as long as the median ({slowest}).\n")
+    print(table(("", "p50 / p95 / p99", "full / draft", "without MKL ÷ p50"), tails))
+    print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. V is the")
+    print("number of coarse vertices. Without [MKL](../reference/glossary.md#blas-mkl), LAPACK solves.")
     print("\nShapes of quality `auto` are as close to the exact exponential as full shapes.\n")
     print(table(("mean distance, 1e-4 of the diagonal", "auto", "full", "draft"), exact))
     print("\nIn brackets are multiples of the distance of full shapes. A product by design has a formula instead of an")
@@ -180,18 +177,14 @@ def stages(folders: list[Path], count: int) -> None:
         print(table(("code → vertices, one graph", *(f"batch of {size}" for size in BATCHES), "draft / full"), batches))
         print("\nTimes are for one shape, without a file. All columns are from one run, in turn.")
     least = [each["sum"] / each["blend shapes"] for each in medians.values()]
-    print(f"\nA shape takes {min(least):.0f} to {max(least):.0f} times as long as blend shapes.")
+    print(f"\nA shape takes {min(least):.0f} to {max(least):.0f} times as long as the same file from blend shapes.")
     if limits:
-        print(f"An exact shape takes {min(limits):.0f} to {max(limits):.0f} times as long as a shape.")
-    print()
-    print(table(("", "blend shapes", "exact shape", "auto / full / draft, ÷ SuperLU", "from the solution"), beside))
-    print("\n- *Blend shapes* is a lower bound: it adds m displacement fields and writes the same file.")
-    print("- *Exact shape*: the [exponential](../reference/glossary.md#exponential) with the time steps of the model.")
-    print("- *÷ SuperLU*: in factorisations of the model's own matrix by [SuperLU](../reference/glossary.md#superlu).")
-    print(
-        "- *From the solution*: distance of the furthest vertex of a full shape from a solution with tolerance 1e-10,"
-    )
-    print("  in millionths of the diagonal: median and largest over the codes.")
+        print("An [exact shape](../reference/glossary.md#exponential) takes")
+        print(f"{min(limits):.0f} to {max(limits):.0f} times as long as a shape.")
+    # The other tables are for developers.
+    print(table(("model", "networks", "reconstruction (steps)", "file", "sum"), own), file=sys.stderr)
+    print(table(("", "blend shapes", "exact shape", "auto / full / draft, ÷ SuperLU", "away"), beside), file=sys.stderr)
+    print("Away: from a solution of tolerance 1e-10, in millionths of the diagonal: median, largest.", file=sys.stderr)
 
 
 def to_exact(model: ShapeModel, codes: Codes) -> list[str]:
@@ -329,16 +322,14 @@ def growth(count: int) -> None:
                 sums.append(median["sum"])
                 largest = max(largest, resident(os.getpid()))
                 size = str(model.manifest.vertices if kind == "V" else latents)
-                solved = f"{ms(median['reconstruct'])} ({steps:.1f})"
-                ratio = f"{median['sum'] / median['SuperLU']:.2f}"
-                found.append([size, ms(median["network"]), solved, ms(median["sum"]), ratio])
+                found.append([size, ms(median["sum"]), f"{steps:.1f}"])
             if kind == "V":
                 print("\nTime grows faster than the number of coarse vertices V: larger meshes need more steps too.")
                 print("The number m of modes makes almost no difference.\n")
-                print(table((kind, "networks", "reconstruction (steps)", "sum", "sum ÷ SuperLU"), found))
+                print(table((kind, "time", "steps of [Gauss–Newton](../reference/glossary.md#gaussnewton)"), found))
                 print()
             power = np.polyfit(np.log(sizes), np.log(sums), 1)[0]
-            print(f"From {kind} = {sizes[0]} to {sizes[-1]}, the sum grows like {kind}^{power:.2f}.")
+            print(f"From {kind} = {sizes[0]} to {sizes[-1]}, the time grows like {kind}^{power:.2f}.")
     print(f"The shapes are synthetic capsules. The process took at most {largest:.0f} MB, for the largest V.")
 
 

@@ -38,12 +38,12 @@ JOINT, OF_FACTORS, CODES = 100, 50, 30
 #: Stored figures of all sizes.
 FIGURES = ROOT / "runs" / "growth.json"
 #: Stages in the table.
-COLUMNS = ("ingest", "modes", "samples", "networks")
+COLUMNS = ("ingest", "modes")
 
 PAGE = """# How training grows
 
-How much time and memory does a training run need, and what makes it need more? Each row changes one size of a base run.
-[Is it for my data?](../is-it-for-me.md) has the minutes of whole runs.
+How much time and memory does training need, and what makes it need more? [Is it for my data?](../is-it-for-me.md) has
+the minutes of whole runs.
 
 - **Time**: `ingest` grows with files of more than 40,000 vertices, and `modes` with the number of shapes. All other
   [stages](../reference/run-directory.md) grow with the coarse mesh.
@@ -51,16 +51,15 @@ How much time and memory does a training run need, and what makes it need more? 
 
 {table}
 
-Stages are in seconds of [CPU time](../reference/glossary.md#cpu-time), with worker processes (one for each core). *All*
-is the whole run without the time to start, and the memory of its largest process.
+Times are [CPU time](../reference/glossary.md#cpu-time), without the time to start.
 
 - The base has {base.shapes} shapes of {base.fine:,} vertices, {base.coarse} coarse vertices and {base.modes} modes.
+  Each other row changes one of these.
 - `samples` and `networks` also grow with the number of samples: here {joint} joint ones and {factors} of each factor.
   The defaults are 4000 and 1000.
-- Meshes of more than 20,000 vertices are first thinned by many collapses at once. So 40,000 vertices take no longer
-  than 10,000. We do not know why reading takes less time with 2,000 coarse vertices than with 1,000.
+- Meshes of more than 20,000 vertices are first thinned by many collapses at once.
 
-{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on
+{people}The collections are capsules that bend and bulge. `python -m benchmarks.stages` trains on
 them with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
 """
 
@@ -203,16 +202,15 @@ def write_page() -> None:
     for row in found["rows"]:
         title = Size(**row["size"]).beside(BASE) or "base"
         spent = row["seconds"]
-        ingest, modes, samples, networks = (f"{spent[stage]:.1f}" for stage in COLUMNS)
-        whole = f"{sum(spent.values()):.0f} s, {row['megabytes']['most']:.0f} MB"
-        rows.append([title, ingest, modes, f"{samples}, {networks}", whole])
+        whole = f"{sum(spent.values()):.0f} s", f"{row['megabytes']['most']:.0f} MB"
+        rows.append([title, *whole, *(f"{spent[stage]:.1f} s" for stage in COLUMNS)])
     page = PAGE.format(
         people=people_section(found["people"]) if found.get("people") else "",
         base=BASE,
         joint=JOINT,
         factors=OF_FACTORS,
         measured=pages.measured_with(FIGURES),
-        table=table(("", "`ingest`", "`modes`", "`samples`, `networks`", "all: time, memory"), rows),
+        table=table(("", "time", "memory", *(f"time of `{stage}`" for stage in COLUMNS)), rows),
     )
     pages.write("growth", page)
 

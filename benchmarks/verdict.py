@@ -34,7 +34,7 @@ TITLES = {
 PAYS = 0.7
 #: Figures beside the errors of simple models in a fold: our own errors, and the number of shapes.
 OURS = ("mean", "p95", "shapes", "nothing remembered")
-COMPONENTS, WITH_IMAGES = "components", "principal components of the shapes and of their mirror images"
+COMPONENTS, WITH_IMAGES = "components", "components with mirror images"
 #: Ending of the names of runs with half as many modes.
 HALF = "-half"
 #: Runs without baselines and studies, whose times are those of a user.
@@ -109,7 +109,6 @@ class TrainingTime:
     """Size of a training run, and the minutes that it took."""
 
     title: str
-    shapes: int
     vertices: int
     computed: int  # exact shapes that the networks learn from
     minutes: float
@@ -123,16 +122,14 @@ def times(runs: Path = RUNS) -> list[TrainingTime]:
         counts, ingest = run["drawn"], run["ingest"]
         computed = counts["joint"] + counts["of factors"]
         title = TITLES[name.partition("-")[0]]
-        found.append(
-            TrainingTime(title, ingest["shapes"], ingest["vertices"], computed, sum(run["seconds"].values()) / 60)
-        )
+        found.append(TrainingTime(title, ingest["vertices"], computed, sum(run["seconds"].values()) / 60))
     log = [json.loads(line) for line in (runs / "figure" / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     ingested = next(line for line in log if line["event"] == "ingested")
     # Later calls of the same run repeat single stages.
     seconds = {line["stage"]: line["seconds"] for line in reversed(log) if line["event"] == "end"}
     computed = json.loads((runs / "figure" / "evaluation.json").read_text(encoding="utf-8"))["exponentials"]
     minutes = sum(seconds.values()) / 60
-    found.append(TrainingTime(TITLES["figure"], ingested["shapes"], ingested["vertices"], computed, minutes))
+    found.append(TrainingTime(TITLES["figure"], ingested["vertices"], computed, minutes))
     return sorted(found, key=lambda run: run.minutes)
 
 
@@ -175,13 +172,6 @@ def listed(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
-def beaten(some: list[CollectionErrors], rival: str) -> str:
-    """Say for which collections a simple model is better than ours; empty if for none."""
-    worse = [each for each in some if each.ratios[rival] < each.ratio]
-    ours = listed([f"{each.ratio:.2f}" for each in worse])
-    return f" For {listed([each.title for each in worse])} this is better than our model ({ours})." if worse else ""
-
-
 def cost_of_fewer_shapes(runs: Path) -> str:
     """Say how little accuracy a run with fewer computed shapes loses, by the example of the dancer."""
     fewer, every = (pages.read_figures(runs / "results" / f"{name}.json") for name in ("samba-few", "samba"))
@@ -198,22 +188,18 @@ def cost_of_fewer_shapes(runs: Path) -> str:
 def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
     """Return the text of the page."""
     by_name = {each.name: each for each in found}
-    rivals = dict.fromkeys(each.best for each in found if each.best)
     return pages.render(
         "verdict",
         every=found,
         better=[each for each in found if each.pays],
         equal=[each for each in found if not each.pays],
-        beside=[(name, [each for each in found if each.best == name]) for name in rivals],
+        worse=[each for each in found if each.best and each.ratios[each.best] < each.ratio],
         titles=lambda some: listed([each.title for each in some]),
         range=lambda some: f"{min(each.ratio for each in some):.2f} to {max(each.ratio for each in some):.2f}",
-        ratios_of=lambda some, name: listed([f"{each.ratios[name]:.2f}" for each in some]),
-        beaten=beaten,
         cost=cost_of_fewer_shapes(runs),
         measured=pages.measured_with(*(runs / "collections" / f"{name}.json" for name in by_name)),
         ratio_of=lambda name: f"{by_name[name].ratio:.2f}",
         fewer={"whole": by_name["samba"], "half": collection("samba" + HALF, runs)},
-        images=WITH_IMAGES,
         times=times(runs),
         growth=pages.read_figures(runs / "growth.json")["rows"],
     )

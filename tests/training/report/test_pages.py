@@ -80,8 +80,7 @@ def test_a_simple_model_that_is_measured_later_is_in_the_verdict(tmp_path: Path)
             fold["unseen"][rival] = {key: share * value for key, value in fold["unseen"]["components"].items()}
     pages.write_figures(file, folds)
     found = verdict.collections(tmp_path)
-    said = "**A better simple model** for hands: linear skinning. Its error is 0.25 of the error of plain components"
-    assert said in verdict.page(found, tmp_path)
+    assert "| hands, 57 | 12 | 0.11 % | 0.30 | 0.25, linear skinning |" in verdict.page(found, tmp_path)
     chart = tmp_path / "chart.svg"
     verdict.draw(found, chart)
     assert ">0.25</text>" in chart.read_text(encoding="utf-8")
@@ -113,5 +112,5 @@ def test_draws_of_as_many_shapes_are_one_row_of_their_means() -> None:
     ]
     assert few_shapes.simplest(found["hand", 5]) == ("components", pytest.approx(0.05))
     said = few_shapes.finding(found)
-    assert "hand 75 %" in said, "from 0.04 to 0.01 with one doubling"
-    assert "hand 0.50" in said
+    assert "75 % (hand)" in said, "from 0.04 to 0.01 with one doubling"
+    assert "0.50 (hand)" in said
