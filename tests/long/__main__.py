@@ -1,7 +1,7 @@
 """Run tests that take minutes to hours, and record when each last passed: ``python -m tests.long [NAME …]``.
 
 Without a name it lists the tests, what each does, and how many commits have changed its folders since it last
-passed. The record is a table in benchmarks/NOTES.md; commit that file afterwards. A run with
+passed. The record is a table in docs/measurements/reliability.md; commit that page afterwards. A run with
 ``ARGS``, which may select a part, is not recorded.
 """
 
@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-RECORD = ROOT / "benchmarks" / "NOTES.md"
-#: Lines of that file between which the table stands.
+RECORD = ROOT / "docs" / "measurements" / "reliability.md"
+#: Lines of that page between which the table stands.
 BEGIN, END = "<!-- long tests: written by `make long` -->", "<!-- end of long tests -->"
 HEAD = "| long test | last passed | commit | minutes | amount |\n|---|---|---|---|---|\n"
 #: The suite's tests that are marked `long`, in files beside one another as in `make test`.
