@@ -43,6 +43,12 @@ class PlaceError(MeshError):
         return self.numbered()
 
 
+def require_vertices(corners: IntArray, count: int) -> None:
+    """Raise MeshError if a corner is none of ``count`` vertices."""
+    if corners.size and not 0 <= corners.min() <= corners.max() < count:
+        raise MeshError(f"faces name vertices {corners.min()} to {corners.max()}, but there are {count} vertices")
+
+
 class Connectivity:
     """Faces and edges, shared by all meshes of a collection.
 
@@ -65,8 +71,7 @@ class Connectivity:
         if not np.issubdtype(f.dtype, np.integer):
             raise MeshError(f"faces must be integers, not {f.dtype}")
         f = f.astype(np.int64)
-        if f.min() < 0 or f.max() >= vertex_count:
-            raise MeshError(f"faces name vertices {f.min()} to {f.max()}, but there are {vertex_count} vertices")
+        require_vertices(f, vertex_count)
         repeated = np.flatnonzero((f[:, 0] == f[:, 1]) | (f[:, 1] == f[:, 2]) | (f[:, 2] == f[:, 0]))
         if len(repeated):
             raise PlaceError("face {face} names the same vertex twice", {"face": [int(repeated[0])]})
