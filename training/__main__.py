@@ -15,7 +15,7 @@ from shapespace.training.stages import STAGE_NAMES
 
 #: Packages of the extra ``train`` by the names of their modules, without those that are only faster.
 NEEDED = (
-    "PIL", "jinja2", "joblib", "matplotlib", "onnx", "onnxruntime", "onnxscript", "pydantic", "safetensors",
+    "PIL", "filelock", "jinja2", "joblib", "matplotlib", "onnx", "onnxruntime", "onnxscript", "pydantic", "safetensors",
     "tomlkit", "torch", "tqdm", "trimesh",
 )  # fmt: skip
 #: What ``init`` reads.

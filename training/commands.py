@@ -26,7 +26,7 @@ from shapespace.training.report.record import ReportError, require_run
 from shapespace.training.runs import workers
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import ConfigError, load
-from shapespace.training.runs.directory import NotARunError, RunDirectory
+from shapespace.training.runs.directory import NotARunError, RunDirectory, RunInUseError
 from shapespace.training.runs.sampling import SamplesError
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
@@ -51,6 +51,7 @@ EXPECTED = (
     NotARunError,
     OldRunError,
     ReportError,
+    RunInUseError,
     SamplesError,
     WorkersError,
 )

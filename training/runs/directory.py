@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +24,10 @@ File = TypeVar("File")
 
 class NotARunError(ValueError):
     """A folder that holds something else than a run."""
+
+
+class RunInUseError(RuntimeError):
+    """A run that another process is working on."""
 
 
 class RunFile(Generic[File]):
@@ -50,6 +56,7 @@ class RunDirectory:
     traceback = RunFile(TextFile, "traceback.txt")
     """Traceback of an error that is a defect of this program."""
     _log = RunFile(Path, "log.jsonl")
+    _holder = RunFile(TextFile, "stages/process.txt")
 
     def is_run(self) -> bool:
         """Return whether the folder looks like a run directory, so that it can be read."""
@@ -79,6 +86,29 @@ class RunDirectory:
                 "empty or a new folder with --out"
             )
         self._stamps.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from working on the run; raise RunInUseError if one does.
+
+        The lock belongs to the operating system, which releases it however the process ends.
+        """
+        import filelock
+
+        lock = filelock.FileLock(self._stamps / "lock", timeout=0)
+        try:
+            lock.acquire()
+        except filelock.Timeout:
+            holder = self._holder.read() if self._holder.exists() else "another process"
+            raise RunInUseError(
+                f"{holder} is working on the run {self.folder}: wait until it ends, or stop it"
+            ) from None
+        with lock:
+            self._holder.write(f"process {os.getpid()} on {platform.node()}")
+            try:
+                yield
+            finally:
+                self._holder.path.unlink(missing_ok=True)
 
     def stamp(self, stage: str) -> JsonFile:
         """``key``, ``basis`` and ``version`` of a stage that has begun, and ``seconds`` once it is done.

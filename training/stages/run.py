@@ -75,18 +75,22 @@ def execute(
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
         NotARunError: the run directory holds something else, or the collection's data.
+        RunInUseError: another process is working on the run.
         BundleError: the place of the bundle holds something else.
         DamagedFileError: a file was damaged, and was so again after its stage had made it anew.
     """
     repaired = set[Path]()
-    while True:
-        try:
-            return _execute(run, until, keep_going=keep_going, command=command, show=show)
-        except DamagedFileError as error:
-            if error.path in repaired:
-                raise
-            repaired.add(error.path)
-            _discard(run.directory, error.path, show)
+    run.directory.begin()
+    _refuse_own_data(run)
+    with run.directory.locked():
+        while True:
+            try:
+                return _execute(run, until, keep_going=keep_going, command=command, show=show)
+            except DamagedFileError as error:
+                if error.path in repaired:
+                    raise
+                repaired.add(error.path)
+                _discard(run.directory, error.path, show)
 
 
 def _discard(directory: RunDirectory, path: Path, show: Callable[[str], None]) -> None:
@@ -182,8 +186,6 @@ def replaces_another(run: Run) -> str:
 def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
     """Remove outdated results and write the configuration. Return the keys of the stages, and facts about the data."""
     directory, source = run.directory, run.config.collection.data
-    directory.begin()
-    _refuse_own_data(run)
     data, known = _data_facts(run), directory.data.read_if_written()
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)

@@ -204,6 +204,12 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_nobody_disturbed(place: Path,
     while not list(place.glob("killed/samples/part-*.npz")):
         assert process.poll() is None, "the run ended before it could be killed"
         time.sleep(0.001)
+    os.killpg(process.pid, signal.SIGSTOP)
+    before = {path: path.read_bytes() for path in (place / "killed").rglob("*") if path.is_file()}
+    for other in (killed, ("export", "killed")):
+        (sentence,) = said(*other, code=1).splitlines()
+        assert re.search(rf": process {process.pid} on \S+ is working on the run killed: wait until", sentence)
+    assert {path: path.read_bytes() for path in (place / "killed").rglob("*") if path.is_file()} == before
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     said(*whole)
