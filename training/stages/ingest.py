@@ -21,7 +21,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.settings import NEARLY_COARSE, CollectionSettings
 from shapespace.training.space.generalisation import FOLDS
-from shapespace.training.stages.stage import Run, Stage, StageWarning, read_meshes
+from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 #: Most vertices of all fine shapes together for which fine detail is learned. It takes memory for several copies.
 MOST_DETAILED = 8_000_000
@@ -41,8 +41,8 @@ def ingest(run: Run) -> None:
     if run.by_design:
         write_reference(directory, run.collection.reference, run.collection.scale)
         return
-    meshes = read_meshes(run.config)
-    meshes.require_accepted(run.accepted)
+    meshes = run.meshes
+    del run.meshes  # they may be large
     chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)

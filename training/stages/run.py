@@ -12,7 +12,7 @@ from shapespace.bundle.writer import require_replaceable
 from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
-from shapespace.training.runs.config import Config
+from shapespace.training.runs.config import Config, stored_data
 from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.runs.progress import stage_place
 from shapespace.training.stages import (  # fmt: skip
@@ -28,7 +28,7 @@ from shapespace.training.stages import (  # fmt: skip
     samples,
 )
 from shapespace.training.stages.results import LostFile, bundle_fault, file_facts, lost_files, written
-from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning, read_meshes
+from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
 _MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
 STAGES: dict[str, Stage] = {name: module.STAGE for name, module in zip(STAGE_NAMES, _MODULES, strict=True)}
@@ -191,7 +191,15 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         refuse_old(directory)
     if gone := bool(source and known and not source.exists()):
         data = known
-    elif known and (changes := _changes(known, data)):
+    elif source and known and (changes := _changes(known, data)):
+        if (before := stored_data(directory.config.path)) not in (None, source) and not run.force:
+            raise IngestError(
+                Fault(
+                    str(source),
+                    f"the run {directory.folder} has the results of other meshes, {before}",
+                    "name another run directory with --out, or replace all results with --force",
+                )
+            )
         show(f"data: {changes}; all stages from ingest on run again")
     if unused := run.config.unused:
         show(
@@ -205,8 +213,8 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         show(f"data: {source} does not exist any more; the run continues with the results of ingest")
     elif gone:
         raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
-    elif source and changed and "seconds" in stamp:
-        read_meshes(run.config).require_accepted(run.accepted)  # raises its errors before results are removed
+    elif changed and "seconds" in stamp and not run.by_design:
+        _ = run.meshes  # raises its errors before results are removed
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data
