@@ -220,7 +220,7 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
         model.decode(np.zeros((1, 1, 3)))
     with pytest.raises(OutOfBoundsError):
         model.decode([0, 0, 2], bounds="reject")
-    with pytest.raises(ValueError, match="'large' is not a valid MeshChoice"):
+    with pytest.raises(ValueError, match="'large' is not a valid MeshChoice: choose among fine, coarse"):
         model.decode(CODES, mesh="large")  # type: ignore[arg-type]
     with pytest.raises(InvalidMeshError, match=r"\(V, 3\)"):
         model.encode(np.zeros(3))
