@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.counted import counted
 from shapespace.mesh.vectors import components, cross, unit
 
 
@@ -77,7 +78,9 @@ class Connectivity:
             raise PlaceError("face {face} names the same vertex twice", {"face": [int(repeated[0])]})
         unused = np.setdiff1d(np.arange(vertex_count), f)
         if len(unused):
-            raise MeshError(f"vertex {unused[0]} belongs to no face ({len(unused)} such vertices)")
+            raise MeshError(
+                f"vertex {unused[0]} belongs to no face ({counted(len(unused), 'such vertex', 'such vertices')})"
+            )
 
         self.faces: IntArray = f
         self.vertex_count = int(vertex_count)

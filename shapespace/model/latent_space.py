@@ -9,6 +9,7 @@ from scipy.special import ndtr, ndtri
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.schema import Manifest
+from shapespace.counted import counted
 from shapespace.model.choice import Choice
 
 #: (n, m) codes as the networks take them; everything that identifies a shape is derived from this form.
@@ -113,7 +114,7 @@ class LatentSpace:
             if len(value) != self.dimension:
                 names = f" ({'; '.join(self.names)})" if self.dimension <= 12 else ""
                 raise WrongLengthError(
-                    f"Code {i} has {len(value)} numbers, but {self.model} takes {self.dimension}{names}. "
+                    f"Code {i} has {counted(len(value), 'number')}, but {self.model} takes {self.dimension}{names}. "
                     f"Give exactly {self.dimension}."
                 )
         with np.errstate(over="ignore"):

@@ -8,6 +8,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.attributes import surface_arrays, surface_entry
+from shapespace.counted import counted
 from shapespace.mesh.attached_parts import attach_part
 from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.fine_detail import GAIN, RIDGES
@@ -202,8 +203,8 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
         sentences.append(f"coarse mesh: {facts['reason']}")
     if facts.get("folds"):
         sentences.append(
-            f"coarse mesh: {facts['folds']} pairs of neighbouring faces are folded onto one another in some shape. "
-            f"Logarithms and samples may fail there; {REMEDY}"
+            f"coarse mesh: {counted(facts['folds'], 'pair')} of neighbouring faces that are folded onto one another in "
+            f"some shape. Logarithms and samples may fail there; {REMEDY}"
         )
     if facts.get("smallest_angle", np.inf) < LEAST_ANGLE:
         sentences.append(

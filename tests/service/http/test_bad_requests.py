@@ -78,12 +78,12 @@ REQUESTS = {
     "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Give exactly 3"),
     "no code": post(VERTICES, {"latents": []}, 422, "invalid-request", "Send at least one code"),
     "one code for many": post(VERTICES, {"latents": OK}, 422, "invalid-request", "Send a list for latents[0]"),
-    "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 number,"),
     "too many codes": post(VERTICES, {"latents": [OK] * 21}, 422, "too-many-codes", "Send several requests"),
     "too many codes for NRIC": post(NRIC, {"latents": [OK] * 21}, 422, "too-many-codes", "the limit is 20"),
     "factors as text": post(NRIC, {"latents": [OK], "factors": "yes"}, 422, "invalid-request", "true or false"),
     "one keyframe": post(PATHS, {"keyframes": [OK]}, 422, "invalid-request", "2 or more entries for keyframes"),
-    "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 number,"),
     "times run back": post(
         PATHS, {"keyframes": [OK, OK, OK], "times": [0, 2, 1]}, 422, "invalid-request", "times must increase"
     ),

@@ -133,7 +133,7 @@ def test_meshes_become_a_table_and_a_bad_one_stops_nothing(shell: Shell, model: 
     (tmp_path / "odd.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     files = [tmp_path / name for name in ("a.ply", "odd.obj", "none.ply", "b.ply")]
     good, odd, none, poor = table(shell("encode", "small", *files, "--fixed", '{"2": 0.4}', code=1))
-    assert "2 of 4 files have no code" in shell.err
+    assert "no code for 2 of 4 files" in shell.err
     assert (good["status"], good["inside_bounds"]) == ("converged", "True")
     assert good["file"] == str(files[0])
     np.testing.assert_allclose([float(good[name]) for name in model.names], [0.1, 0.7, 0.4], atol=1e-3)
@@ -194,7 +194,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("page small --out plain", 1, "plain is a file; name a folder"),
         ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
         ("fit small a.ply --json plain", 1, "plain: exists already"),
-        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3 ("),
+        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 number, but small takes 3 ("),
         ("decode small --latent 9,0,0 --bounds reject --out x.glb", 1, "Move it inside"),
         ("decode small --latent 1,x,2 --out x.glb", 2, "is not a list of numbers"),
         ("decode small --latent 1,2,3 --random 2 --out x", 2, "choose --latent or --random"),
