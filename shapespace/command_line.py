@@ -52,15 +52,22 @@ def _version() -> click.Option:
 
 
 class FileOrFolder(click.Path):
-    """Path of the command line, which must not be empty, as after a misspelt variable of the shell."""
+    """Path of the command line, which must not be empty, as after a misspelt variable of the shell.
 
-    def __init__(self) -> None:
+    Args:
+        standard: whether ``-`` may be standard input or output.
+    """
+
+    def __init__(self, *, standard: bool = True) -> None:
         super().__init__(path_type=Path, readable=False)  # reading it says more
+        self._standard = standard
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path; fail if it is empty."""
+        """Return the path; fail if it is empty, or standard output where that can't be."""
         if value == "":
             self.fail("it is empty; name a file or folder, . for this one", param, ctx)
+        if value == "-" and not self._standard:
+            self.fail("the results can't go to standard output; name a file or folder", param, ctx)
         return super().convert(value, param, ctx)
 
 

@@ -27,7 +27,10 @@ _SUBJECTS = "read this file from each folder in MESH_DIR, for data with one fold
 _UNTIL = f"stop after this stage: {', '.join(STAGE_NAMES)}"
 _RUN = click.Argument(["run"], type=FileOrFolder(), metavar="RUN")
 _MODELS = click.Option(
-    ["--models"], type=FileOrFolder(), default="models", help="folder for the finished bundle (default: models)"
+    ["--models"],
+    type=FileOrFolder(standard=False),
+    default="models",
+    help="folder for the finished bundle (default: models)",
 )
 
 
@@ -55,7 +58,7 @@ COMMANDS = (
             click.Argument(["meshes"], type=FileOrFolder(), metavar="MESH_DIR"),
             click.Option(
                 ["--out"],
-                type=FileOrFolder(),
+                type=FileOrFolder(standard=False),
                 metavar="FILE.toml",
                 help="file to write (default: the folder's name with .toml, in the current folder)",
             ),
@@ -80,7 +83,7 @@ COMMANDS = (
             ),
             click.Option(
                 ["--out"],
-                type=FileOrFolder(),
+                type=FileOrFolder(standard=False),
                 metavar="DIR",
                 help="folder for the results (default: runs/ and the name of CONFIG.toml)",
             ),

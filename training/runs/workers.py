@@ -196,7 +196,7 @@ def _client(scheduler: str) -> Client:
     try:
         from distributed import Client
     except ImportError as error:
-        raise WorkersError("a scheduler needs Dask: pip install '.[cluster]', from shapespace's folder") from error
+        raise WorkersError("a scheduler needs Dask: pip install 'shapespace[cluster]'") from error
     try:
         return Client(scheduler, timeout=CONNECT, set_as_default=False)
     except (OSError, ValueError) as error:

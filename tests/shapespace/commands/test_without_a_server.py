@@ -78,6 +78,17 @@ def test_the_list_has_models_here_and_installed_models(shell: Shell) -> None:
     assert ["figure", "4", "20", "MIT"] in [row[:4] for row in rows]
 
 
+def test_a_variable_names_the_folder_of_models(
+    shell: Shell, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").mkdir()
+    for place, code in ((folder / "models", 0), ("", 1)):
+        monkeypatch.setenv("SHAPESPACE_MODELS_DIR", str(place))
+        assert ("small " in shell("models")) is (code == 0)
+        shell("decode", "small", "--out", tmp_path / "shape.glb", code=code)
+
+
 def test_random_codes_become_files_with_a_table(shell: Shell, model: ShapeModel, tmp_path: Path) -> None:
     out = tmp_path / "new" / "shapes"
     shell("decode", "small", "--random", "11", "--seed", "3", "--out", out, "--mesh", "coarse")
@@ -166,8 +177,11 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
     assert found["placement"]["scale"] == 1
     placed = expected.placement(expected.shape.vertices)
     np.testing.assert_array_equal(read_arrays(out)[0], placed.astype(np.float32))
+    assert ("look at the fitted shape" in shell.err) is (found["status"] != "converged")
     shell(*command, code=1)
     assert "exists already" in shell.err
+    assert shell(*command, "--force", "--deadline", "1e-9").startswith("deadline: ")
+    assert "The status is deadline: look at the fitted shape" in shell.err
 
 
 def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> None:
@@ -192,6 +206,8 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
         ("page small --out site", 1, "small has no decoder.onnx, which computes shapes in the browser"),
         ("page small --out plain", 1, "plain is a file; name a folder"),
+        ("page figure --out -", 2, "'--out': the results can't go to standard output; name a file or folder"),
+        ("run a.toml --models -", 2, "'--models': the results can't go to standard output"),
         ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
         ("fit small a.ply --json plain", 1, "plain: exists already"),
         ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 number, but small takes 3 ("),
