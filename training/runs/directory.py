@@ -56,7 +56,6 @@ class RunDirectory:
     traceback = RunFile(TextFile, "traceback.txt")
     """Traceback of an error that is a defect of this program."""
     _log = RunFile(Path, "log.jsonl")
-    _holder = RunFile(TextFile, "stages/process.txt")
 
     def is_run(self) -> bool:
         """Return whether the folder looks like a run directory, so that it can be read."""
@@ -95,20 +94,20 @@ class RunDirectory:
         """
         import filelock
 
-        lock = filelock.FileLock(self._stamps / "lock", timeout=0)
+        lock, file = filelock.FileLock(self._stamps / "lock", timeout=0), TextFile(self._stamps / "process.txt")
         try:
-            lock.acquire()
+            held = lock.acquire()
         except filelock.Timeout:
-            holder = self._holder.read() if self._holder.exists() else "another process"
+            holder = file.read() if file.exists() else "another process"
             raise RunInUseError(
                 f"{holder} is working on the run {self.folder}: wait until it ends, or stop it"
             ) from None
-        with lock:
-            self._holder.write(f"process {os.getpid()} on {platform.node()}")
+        with held:
+            file.write(f"process {os.getpid()} on {platform.node()}")
             try:
                 yield
             finally:
-                self._holder.path.unlink(missing_ok=True)
+                file.path.unlink(missing_ok=True)
 
     def stamp(self, stage: str) -> JsonFile:
         """``key``, ``basis`` and ``version`` of a stage that has begun, and ``seconds`` once it is done.
