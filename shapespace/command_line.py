@@ -181,7 +181,8 @@ def call(program: str, command: click.Command, arguments: Sequence[str] | None =
         arguments: of the command line; by default those that the program was called with.
 
     Raises:
-        SystemExit: help, the version or a completion was asked for (0), or an argument is refused (2).
+        SystemExit: help, the version or a completion was asked for (0), an argument is refused (2), or Ctrl-C came
+            before the work began (130).
     """
     variable = f"_{program.upper()}_COMPLETE".replace("-", "_")
     if instruction := os.environ.get(variable):
@@ -194,6 +195,9 @@ def call(program: str, command: click.Command, arguments: Sequence[str] | None =
     except click.UsageError as error:
         print(_refusal(error), file=sys.stderr)
         raise SystemExit(USAGE) from None
+    except KeyboardInterrupt:  # while modules were imported
+        print(f"\n{program}: stopped", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def carry_out(
