@@ -77,12 +77,11 @@ def find_bundle(model: str | os.PathLike[str]) -> Path:
     except BundleError as error:
         refusal = error
     parts = Path(given).parts
-    if not 1 <= len(parts) <= 2 or not all(map(re.fullmatch, (NAME_PATTERN, VERSION_PATTERN), parts)):
-        raise refusal
-    for root in _roots():
+    is_name = 1 <= len(parts) <= 2 and all(map(re.fullmatch, (NAME_PATTERN, VERSION_PATTERN), parts))
+    for root in _roots() if is_name else ():
         with suppress(BundleError):
             return _bundle_in(root / given)
-    if path.is_dir():
+    if path.is_dir() or not (is_name or (len(parts) == 1 and not path.exists())):
         raise refusal
     known = ", ".join(models())
     choice = f"choose among {known}, or" if known else "none is installed;"

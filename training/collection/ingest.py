@@ -22,7 +22,7 @@ from shapespace.training.collection.checks import (
     orientation_notes,
     refusing,
 )
-from shapespace.training.collection.faults import Faults, IngestError
+from shapespace.training.collection.faults import Faults, IngestError, shown
 from shapespace.training.collection.listing import MIN_SHAPES
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.collection.parts import MeshPart, PartSelection, parts_note, select_parts
@@ -161,6 +161,6 @@ def _warnings(
     for warning in found:
         source = sources[warning.shape]
         vertex = f"{shapes.file_numbers[warning.vertex] + source.first}{source.counted}"
-        sentence = f"{source.label}: {warning.sentence.replace('{vertex}', vertex)}"
+        sentence = f"{shown(source.label)}: {warning.sentence.replace('{vertex}', vertex)}"
         warnings.append(replace(warning, sentence=sentence))
     return warnings

@@ -152,7 +152,7 @@ def _stored(path: Path) -> dict[str, Any]:
 
 def _load(path: Path, data: Path | None = None) -> tuple[Config, str]:
     try:
-        text = read_plain(path).decode().replace("\r\n", "\n")
+        text = read_plain(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise ConfigError(
             f"{path}: can't be read: it is not text in UTF-8; name a configuration, CONFIG.toml"

@@ -173,7 +173,7 @@ def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, mo
     assert (listed["small"].version, listed["small"].dimension) == ("10", 3)
     assert listed["figure"].folder == tmp_path / "models" / "figure" / "7"
     assert load("small").manifest.version == "10"
-    for unknown in ("figur", "small/3"):
+    for unknown in ("figur", "small/3", "Figure", "my figure"):
         with pytest.raises(BundleError, match=f"no model {unknown} here: choose among figure, freaky-torus, small, or"):
             load(unknown)
     for folder in ("models/figur", "../figure", "figure/4/5"):
