@@ -239,6 +239,8 @@ def carry_out(
         return FAILURE
     except OSError as error:
         return fail(in_words(error))
+    except MemoryError:
+        return fail("there is not enough memory: ask for less at once, or close other programs")
     except KeyboardInterrupt:
         print(file=sys.stderr)
         return fail(stopped, 128 + received[0])  # as shells report the end by a signal
@@ -304,6 +306,7 @@ def _one_value_each(arguments: Sequence[str], several: set[str]) -> Iterator[str
 def _refusal(error: click.UsageError) -> str:
     """Return the usage of a command, and a sentence about an argument that is refused."""
     message, context = error.format_message(), error.ctx
+    message = message.replace("valid float range", "number").replace("valid integer range", "whole number")
     if context is None or isinstance(error, click.exceptions.NoArgsIsHelpError):
         return message
     advice = context.command.advice if isinstance(context.command, Subcommand) else ""

@@ -60,6 +60,8 @@ def fit(
     **parameters: Any,
 ) -> None:
     """Write the fitted shape and the results, and say how the fit ended."""
+    if out and out == answer:
+        raise click.UsageError("--out and --json name one file: name two", click.get_current_context())
     require_new([path for path in (out, answer) if path], force=force)
     format = format_of(out) if out else ""
     loaded = load(model)

@@ -182,6 +182,8 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
     assert "exists already" in shell.err
     assert shell(*command, "--force", "--deadline", "1e-9").startswith("deadline: ")
     assert "The status is deadline: look at the fitted shape" in shell.err
+    shell(*command, "--force", "--deadline", "1e-9", "--samples", "9" * 15, code=1)
+    assert "there is not enough memory" in shell.err
 
 
 def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> None:
@@ -228,6 +230,10 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("fit small -", 1, "-: can't be read: standard input is not read; save its content in a file first"),
         ("fit small /dev/null", 1, "/dev/null: can't be read: it is a device or a pipe; save its content in a file"),
         ("fit small none.ply --noise 0", 2, "--noise"),
+        ("fit small none.ply --deadline soon", 2, "'--deadline': 'soon' is not a number."),
+        ("fit small none.ply --fixed 1", 2, "'--fixed': needs an object."),
+        ("fit small none.ply --landmarks [{\"vertex\":1,\"position\":[0,0,0],\"sgima\":1}]", 2, "0.sgima: there is no"),
+        ("fit small none.ply --out - --json -", 2, "--out and --json name one file: name two."),
         ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "0.position: is not there; add it"),
         ("fit small none.ply --out", 2, "requires an argument"),
         ("fit small a.ply b.ply", 2, "unexpected extra argument"),
