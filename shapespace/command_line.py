@@ -52,15 +52,22 @@ def _version() -> click.Option:
 
 
 class FileOrFolder(click.Path):
-    """Path of the command line, which must not be empty, as after a misspelt variable of the shell."""
+    """Path of the command line, which must not be empty, as after a misspelt variable of the shell.
 
-    def __init__(self) -> None:
+    Args:
+        standard: whether ``-`` may be standard input or output.
+    """
+
+    def __init__(self, *, standard: bool = True) -> None:
         super().__init__(path_type=Path, readable=False)  # reading it says more
+        self._standard = standard
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path; fail if it is empty."""
+        """Return the path; fail if it is empty, or standard output where that can't be."""
         if value == "":
             self.fail("it is empty; name a file or folder, . for this one", param, ctx)
+        if value == "-" and not self._standard:
+            self.fail("the results can't go to standard output; name a file or folder", param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -174,7 +181,8 @@ def call(program: str, command: click.Command, arguments: Sequence[str] | None =
         arguments: of the command line; by default those that the program was called with.
 
     Raises:
-        SystemExit: help, the version or a completion was asked for (0), or an argument is refused (2).
+        SystemExit: help, the version or a completion was asked for (0), an argument is refused (2), or Ctrl-C came
+            before the work began (130).
     """
     variable = f"_{program.upper()}_COMPLETE".replace("-", "_")
     if instruction := os.environ.get(variable):
@@ -187,6 +195,9 @@ def call(program: str, command: click.Command, arguments: Sequence[str] | None =
     except click.UsageError as error:
         print(_refusal(error), file=sys.stderr)
         raise SystemExit(USAGE) from None
+    except KeyboardInterrupt:  # while modules were imported
+        print(f"\n{program}: stopped", file=sys.stderr)
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def carry_out(
@@ -228,6 +239,8 @@ def carry_out(
         return FAILURE
     except OSError as error:
         return fail(in_words(error))
+    except MemoryError:
+        return fail("there is not enough memory: ask for less at once, or close other programs")
     except KeyboardInterrupt:
         print(file=sys.stderr)
         return fail(stopped, 128 + received[0])  # as shells report the end by a signal
@@ -293,6 +306,7 @@ def _one_value_each(arguments: Sequence[str], several: set[str]) -> Iterator[str
 def _refusal(error: click.UsageError) -> str:
     """Return the usage of a command, and a sentence about an argument that is refused."""
     message, context = error.format_message(), error.ctx
+    message = message.replace("valid float range", "number").replace("valid integer range", "whole number")
     if context is None or isinstance(error, click.exceptions.NoArgsIsHelpError):
         return message
     advice = context.command.advice if isinstance(context.command, Subcommand) else ""

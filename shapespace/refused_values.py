@@ -10,6 +10,7 @@ UNKNOWN = "extra_forbidden"
 #: What a value has to be, by the type of pydantic's fault; `{…}` is a member of the fault's context.
 WANTED = {
     "list_type": "a list",
+    "dict_type": "an object",
     "too_short": "{min_length} or more entries",
     "too_long": "{max_length} or fewer entries",
     "string_type": "a text",

@@ -38,6 +38,9 @@ sys.meta_path.insert(0, Hide())
 sys.argv = sys.argv[2:]
 runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
+#: Runs a module that Ctrl-C stops when it imports one of some packages.
+STOPPING = HIDING.replace('raise ModuleNotFoundError(f"No module named {name!r}", name=name)', "signal.raise_signal(2)")
+STOPPING = f"import signal{STOPPING}"
 
 
 def call(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -184,3 +187,17 @@ def test_what_programs_look_for_is_what_the_extra_installs(extra: str, needed: t
 
 def test_the_help_names_the_stages_that_there_are() -> None:
     assert tuple(STAGES) == STAGE_NAMES == tuple(stage.name for stage in STAGES.values())
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [
+        ("scipy", (EVERY, "decode", "figure", "--out", "-")),
+        ("uvicorn", (SERVE,)),
+        ("safetensors", (TRAIN, "status", "none")),
+    ],
+)
+def test_ctrl_c_while_packages_are_imported_ends_with_a_word(package: str, arguments: tuple[str, ...]) -> None:
+    done = call("-c", STOPPING, package, *arguments)
+    assert (done.returncode, done.stdout, done.stderr.strip().endswith(": stopped")) == (130, "", True)
+    assert "Traceback" not in done.stderr

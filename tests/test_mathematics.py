@@ -24,6 +24,7 @@ NO_MATHEMATICS = {
     "shapespace.mesh.attributes",
     "shapespace.mesh.vectors",
     "shapespace.mesh.vertex_order",
+    "shapespace.model.choice",
     "shapespace.model.correspondence",
     "shapespace.model.encode_faults",
     "shapespace.model.fit_constraints",

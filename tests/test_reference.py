@@ -51,7 +51,8 @@ def test_every_option_of_every_command() -> None:
     for section in page("command").split("\n## ")[1:]:
         title, text = section.split("\n", 1)
         if commands := [PROGRAM.commands[name] for name in title.split(", ") if name in PROGRAM.commands]:
-            options = [option for command in commands for option in command.get_params(click.Context(command))]
+            contexts = [click.Context(command, **command.context_settings) for command in commands]
+            options = [option for context in contexts for option in context.command.get_params(context)]
             names = {name for option in options for name in option.opts if name.startswith("--")}
             assert {name.split()[0] for name in first_cells(text)} == names - {"--help", "--version"}, title
     assert first_cells(page("command").split("\n## ")[0]) == {*PROGRAM.commands}

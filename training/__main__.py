@@ -15,7 +15,7 @@ from shapespace.training.stages import STAGE_NAMES
 
 #: Packages of the extra ``train`` by the names of their modules, without those that are only faster.
 NEEDED = (
-    "PIL", "jinja2", "joblib", "matplotlib", "onnx", "onnxruntime", "onnxscript", "pydantic", "safetensors",
+    "PIL", "filelock", "jinja2", "joblib", "matplotlib", "onnx", "onnxruntime", "onnxscript", "pydantic", "safetensors",
     "tomlkit", "torch", "tqdm", "trimesh",
 )  # fmt: skip
 #: What ``init`` reads.
@@ -27,7 +27,10 @@ _SUBJECTS = "read this file from each folder in MESH_DIR, for data with one fold
 _UNTIL = f"stop after this stage: {', '.join(STAGE_NAMES)}"
 _RUN = click.Argument(["run"], type=FileOrFolder(), metavar="RUN")
 _MODELS = click.Option(
-    ["--models"], type=FileOrFolder(), default="models", help="folder for the finished bundle (default: models)"
+    ["--models"],
+    type=FileOrFolder(standard=False),
+    default="models",
+    help="folder for the finished bundle (default: models)",
 )
 
 
@@ -55,7 +58,7 @@ COMMANDS = (
             click.Argument(["meshes"], type=FileOrFolder(), metavar="MESH_DIR"),
             click.Option(
                 ["--out"],
-                type=FileOrFolder(),
+                type=FileOrFolder(standard=False),
                 metavar="FILE.toml",
                 help="file to write (default: the folder's name with .toml, in the current folder)",
             ),
@@ -80,7 +83,7 @@ COMMANDS = (
             ),
             click.Option(
                 ["--out"],
-                type=FileOrFolder(),
+                type=FileOrFolder(standard=False),
                 metavar="DIR",
                 help="folder for the results (default: runs/ and the name of CONFIG.toml)",
             ),
@@ -100,6 +103,7 @@ COMMANDS = (
                 is_flag=True,
                 help="continue even if more than a quarter of the logarithms or samples fail",
             ),
+            click.Option(["--force"], is_flag=True, help="replace the results of other meshes"),
             _MODELS,
         ],
         ["meshes.toml", "meshes.toml --until modes", "meshes.toml --accept bar3.obj --out runs/again"],

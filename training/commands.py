@@ -26,7 +26,7 @@ from shapespace.training.report.record import ReportError, require_run
 from shapespace.training.runs import workers
 from shapespace.training.runs.atomic_files import DamagedFileError
 from shapespace.training.runs.config import ConfigError, load
-from shapespace.training.runs.directory import NotARunError, RunDirectory
+from shapespace.training.runs.directory import NotARunError, RunDirectory, RunInUseError
 from shapespace.training.runs.sampling import SamplesError
 from shapespace.training.runs.workers import WorkersError
 from shapespace.training.space.factors import FactorError
@@ -51,6 +51,7 @@ EXPECTED = (
     NotARunError,
     OldRunError,
     ReportError,
+    RunInUseError,
     SamplesError,
     WorkersError,
 )
@@ -142,12 +143,13 @@ def run(
     scheduler: str | None,
     accept: Sequence[str],
     keep_going: bool,
+    force: bool,
     models: Path,
 ) -> None:
     """Train the model of a configuration."""
     folder = _folder(config, out)
     settings, source = load(config, data, RunDirectory(folder).config.path)
-    begun = Run(folder, settings, source, models, scheduler, accept)
+    begun = Run(folder, settings, source, models, scheduler, accept, force=force)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
     _execute(begun, until, keep_going=keep_going, command=again)
     if until not in (None, "export"):

@@ -16,7 +16,7 @@ from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.dependencies import Service, known_query
 from shapespace.service.http.description import describe
-from shapespace.service.http.middleware.access import CrossOrigin, RequireHost, RequireKey
+from shapespace.service.http.middleware.access import AcceptWholeAddress, CrossOrigin, RequireHost, RequireKey
 from shapespace.service.http.middleware.compress import Compress
 from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnswers
 from shapespace.service.http.middleware.observe import QUIET, Observe
@@ -123,7 +123,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
             expose_headers=CORS_ANSWER,
         )
         stack.insert(0, cors)
-    return stack
+    return [Middleware(AcceptWholeAddress), *stack]
 
 
 def _hosts(settings: Settings) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from shapespace.bundle.geometry import Geometry
 from shapespace.bundle.schema import Manifest
+from shapespace.counted import counted
 
 #: Licences that Hugging Face knows by these names. Others are called "other" in the head, with their own name.
 _LICENCES = {
@@ -53,7 +54,7 @@ def _text(facts: Manifest, geometry: Geometry) -> str:
     paragraphs = [
         f"# {_line(facts.title or facts.name)}",
         _line(facts.description),
-        f"This model turns {facts.latent_dimension} numbers, a *code*, into a triangle mesh.",
+        f"This model turns {counted(facts.latent_dimension, 'number')}, a *code*, into a triangle mesh.",
         f"Each shape has {len(mesh.vertices)} vertices and the same {len(mesh.faces)} faces.",
         "## Use",
         "Install `shapespace[model]`. Then, in Python:",

@@ -1,4 +1,4 @@
-"""Find bundles by the names of models: in ``models`` of the working directory, and among the installed models."""
+"""Find bundles by the names of models: in a folder of models, and among the installed models."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from shapespace.files.limits import in_words
 
 #: Folder of the models that are installed with the package.
 BUNDLED = Path(__file__).parents[1] / "models"
+#: Environment variable with the folder of models; by default it is ``models`` in the working directory.
+MODELS_DIR = "SHAPESPACE_MODELS_DIR"
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class ListedModel:
 def models() -> dict[str, ListedModel]:
     """Return the models that can be loaded by their names, sorted by name.
 
-    These are the models in the folder ``models`` of the working directory, and the models that are installed with the
-    package. Of two with one name, the model in the working directory counts. A model without a readable manifest is
-    left out; ``load`` says what is wrong with it.
+    These are the models in the folder ``models`` of the working directory, or in ``SHAPESPACE_MODELS_DIR``, and the
+    models that are installed with the package. Of two with one name, the model in the folder counts. A model without a
+    readable manifest is left out; ``load`` says what is wrong with it.
 
     >>> import shapespace
     >>> list(shapespace.models())
@@ -75,12 +77,11 @@ def find_bundle(model: str | os.PathLike[str]) -> Path:
     except BundleError as error:
         refusal = error
     parts = Path(given).parts
-    if not 1 <= len(parts) <= 2 or not all(map(re.fullmatch, (NAME_PATTERN, VERSION_PATTERN), parts)):
-        raise refusal
-    for root in _roots():
+    is_name = 1 <= len(parts) <= 2 and all(map(re.fullmatch, (NAME_PATTERN, VERSION_PATTERN), parts))
+    for root in _roots() if is_name else ():
         with suppress(BundleError):
             return _bundle_in(root / given)
-    if path.is_dir():
+    if path.is_dir() or not (is_name or (len(parts) == 1 and not path.exists())):
         raise refusal
     known = ", ".join(models())
     choice = f"choose among {known}, or" if known else "none is installed;"
@@ -88,7 +89,7 @@ def find_bundle(model: str | os.PathLike[str]) -> Path:
 
 
 def _roots() -> tuple[Path, Path]:
-    return Path("models").absolute(), BUNDLED
+    return Path(os.environ.get(MODELS_DIR) or "models").absolute(), BUNDLED
 
 
 def _bundle_in(folder: Path) -> Path:

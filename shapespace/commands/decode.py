@@ -26,6 +26,7 @@ from shapespace.commands.parameters import (
     require_writable,
     write,
 )
+from shapespace.counted import counted
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds, Codes, Distribution
 from shapespace.model.shape import Quality
@@ -117,7 +118,7 @@ def decode(
                 missed.append(f"{path.name} ({shape.diagnostics.status})")
             write(path, FORMATS[extension].encode(shape.vertices, faces, None, surface))
     if out != STANDARD:
-        print(f"{near(out)}: {count} shapes and {CODES}" if table else near(out), file=sys.stderr)
+        print(f"{near(out)}: {counted(count, 'shape')} and {CODES}" if table else near(out), file=sys.stderr)
     clamped = loaded.latents.codes(given, Bounds.CLAMP)[0]
     far = (np.abs(codes - clamped) > (loaded.upper - loaded.lower) / 2).any(axis=1)
     if guesses := [path.name for path, each in zip(paths, far, strict=False) if each]:

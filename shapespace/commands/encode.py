@@ -14,6 +14,7 @@ import click
 
 from shapespace.command_line import FileOrFolder, fail
 from shapespace.commands.parameters import FORCE, MODEL, REFUSED, STANDARD, chosen, command, options_of, require_new
+from shapespace.counted import counted
 from shapespace.model.options import EncodeOptions
 from shapespace.model.shape_model import load
 
@@ -58,5 +59,5 @@ def encode(model: str, files: Sequence[Path], table: Path, force: bool, **parame
             writer.writerow([os.fspath(path), *row])
             file.flush()
     if refused:
-        return fail(f"{refused} of {len(files)} files have no code: the column reason says why")
+        return fail(f"no code for {refused} of {counted(len(files), 'file')}: the column reason says why")
     return 0

@@ -26,6 +26,7 @@ from shapespace.commands.parameters import (
 )
 from shapespace.mesh.triangle_mesh import MeshError
 from shapespace.model.decoder import MeshChoice
+from shapespace.model.fit_result import FitStatus
 from shapespace.model.options import FitOptions
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.shape_model import load
@@ -59,6 +60,8 @@ def fit(
     **parameters: Any,
 ) -> None:
     """Write the fitted shape and the results, and say how the fit ended."""
+    if out and out == answer:
+        raise click.UsageError("--out and --json name one file: name two", click.get_current_context())
     require_new([path for path in (out, answer) if path], force=force)
     format = format_of(out) if out else ""
     loaded = load(model)
@@ -74,6 +77,8 @@ def fit(
         write(answer, TypeAdapter(Any).dump_json(found.answer(), fallback=_lists) + b"\n")
     told = sys.stderr if STANDARD in (out, answer) else sys.stdout
     print(f"{found.status}: {found.reason}\ncode: {','.join(found.code.astype(str))}", file=told)
+    if found.status is not FitStatus.CONVERGED:
+        print(f"The status is {found.status}: look at the fitted shape before you use it", file=sys.stderr)
 
 
 def _lists(array: NDArray) -> list[Any]:

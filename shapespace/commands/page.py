@@ -28,7 +28,9 @@ _UNSEEN = {"combiner", "decoder", "files", "geometry", "onnx_tolerance", "origin
 
 PARAMS = (
     MODEL,
-    click.Option(["--out"], type=FileOrFolder(), required=True, metavar="FOLDER", help="folder for the files"),
+    click.Option(
+        ["--out"], type=FileOrFolder(standard=False), required=True, metavar="FOLDER", help="folder for the files"
+    ),
     FORCE,
 )
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import click
 from click.shell_completion import CompletionItem
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from shapespace.bundle.finding import models
 from shapespace.bundle.reader import BundleError
@@ -34,6 +34,8 @@ K = TypeVar("K")
 FORMATS = {**MESH_FORMATS, "zip": OBJ_ZIP, **USD_FORMATS, **VTK_FORMATS}
 #: Module that writes a format, and the extra that installs it.
 _WRITERS = dict.fromkeys(USD_FORMATS, ("pxr", "usd")) | dict.fromkeys(VTK_FORMATS, ("vtkmodules", "vtk"))
+#: Sentences about faults of JSON, by pydantic's types.
+_WORDS = {"unexpected_keyword_argument": "there is no such member; remove it or correct its spelling"}
 #: The path of standard input or output.
 STANDARD = Path("-")
 
@@ -59,14 +61,14 @@ class _JsonType(click.ParamType):
     name = "json"
 
     def __init__(self, kind: Any) -> None:
-        self._adapter: TypeAdapter[Any] = TypeAdapter(kind)
+        self._adapter: TypeAdapter[Any] = TypeAdapter(kind, config=ConfigDict(extra="forbid"))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the value that JSON describes; fail with the first fault."""
         try:
             return self._adapter.validate_json(value)
         except ValidationError as error:
-            self.fail(in_short(error.errors(include_url=False, include_input=False), {})[0], param, ctx)
+            self.fail(in_short(error.errors(include_url=False, include_input=False), _WORDS)[0], param, ctx)
 
 
 MODEL = click.Argument(["model"], type=_ModelType(), metavar="MODEL")

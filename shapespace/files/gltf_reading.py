@@ -28,7 +28,7 @@ from shapespace.files.gltf_document import (
 )
 from shapespace.files.limits import UNLIMITED, Limits, label
 from shapespace.files.polygon_reading import strip_triangles
-from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.mesh.triangle_mesh import MeshError, require_vertices
 
 #: Most primitives of a scene, counted at each of their places.
 _MOST_PRIMITIVES = 1000
@@ -229,10 +229,7 @@ class PlacedPrimitive:
             corners = np.arange(count)
         else:
             corners = self.indices.read(buffers).ravel().astype(np.int64)
-            if corners.max() >= count:
-                raise MeshError(
-                    f"faces name vertices {corners.min()} to {corners.max()}, but there are {count} vertices"
-                )
+            require_vertices(corners, count)
         if self.mode == _TRIANGLES:
             faces = corners.reshape(-1, 3)
         elif self.mode == _STRIP:

@@ -12,7 +12,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.files.polygon_reading import ENDS_EARLY, strip_triangles
 from shapespace.mesh.attributes import MeshAttributes
-from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.mesh.triangle_mesh import MeshError, require_vertices
 
 #: Types of cells in unstructured grids: points and lines, which are left out, and cells that have area.
 _WITHOUT_AREA = (0, 1, 2, 3, 4)
@@ -87,12 +87,6 @@ def surface(vertices: FloatArray, cells: list[VtkCells], limits: Limits) -> tupl
     limits.check(len(vertices), len(faces))
     require_vertices(faces, len(vertices))
     return vertices, faces
-
-
-def require_vertices(corners: IntArray, count: int) -> None:
-    """Raise MeshError if a corner is none of ``count`` vertices."""
-    if corners.size and not 0 <= corners.min() <= corners.max() < count:
-        raise MeshError(f"faces name vertices {corners.min()} to {corners.max()}, but there are {count} vertices")
 
 
 def other_kind(kind: str) -> str:

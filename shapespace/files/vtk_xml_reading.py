@@ -20,9 +20,9 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.files.limits import Limits
 from shapespace.files.pcd_reading import repeat
 from shapespace.files.polygon_reading import ENDS_EARLY
-from shapespace.files.vtk_cells import VtkCells, other_kind, require_vertices, surface
+from shapespace.files.vtk_cells import VtkCells, other_kind, surface
 from shapespace.files.vtk_reading import DAMAGED, numbers
-from shapespace.mesh.triangle_mesh import MeshError
+from shapespace.mesh.triangle_mesh import MeshError, require_vertices
 
 _QUOTED = rb"\"[^\"]{0,1000}\"|'[^']{0,1000}'"
 _TAG = re.compile(rb"<!--.*?(?:-->|\Z)|<(/?)([A-Za-z]\w{0,30})((?:[^<>\"']++|" + _QUOTED + rb"){0,100}+)>", re.DOTALL)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.counted import counted
 from shapespace.mesh.vectors import components, cross, unit
 
 
@@ -43,6 +44,12 @@ class PlaceError(MeshError):
         return self.numbered()
 
 
+def require_vertices(corners: IntArray, count: int) -> None:
+    """Raise MeshError if a corner is none of ``count`` vertices."""
+    if corners.size and not 0 <= corners.min() <= corners.max() < count:
+        raise MeshError(f"faces name vertices {corners.min()} to {corners.max()}, but there are {count} vertices")
+
+
 class Connectivity:
     """Faces and edges, shared by all meshes of a collection.
 
@@ -65,14 +72,15 @@ class Connectivity:
         if not np.issubdtype(f.dtype, np.integer):
             raise MeshError(f"faces must be integers, not {f.dtype}")
         f = f.astype(np.int64)
-        if f.min() < 0 or f.max() >= vertex_count:
-            raise MeshError(f"faces name vertices {f.min()} to {f.max()}, but there are {vertex_count} vertices")
+        require_vertices(f, vertex_count)
         repeated = np.flatnonzero((f[:, 0] == f[:, 1]) | (f[:, 1] == f[:, 2]) | (f[:, 2] == f[:, 0]))
         if len(repeated):
             raise PlaceError("face {face} names the same vertex twice", {"face": [int(repeated[0])]})
         unused = np.setdiff1d(np.arange(vertex_count), f)
         if len(unused):
-            raise MeshError(f"vertex {unused[0]} belongs to no face ({len(unused)} such vertices)")
+            raise MeshError(
+                f"vertex {unused[0]} belongs to no face ({counted(len(unused), 'such vertex', 'such vertices')})"
+            )
 
         self.faces: IntArray = f
         self.vertex_count = int(vertex_count)

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from shapespace.coordinates.reconstruction import MAX_ITERATIONS, Reconstructor
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.choice import Choice
 from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentSpace, NotFiniteError, TrainingCodes
 from shapespace.model.memory import FACTOR, Examples, Fade, on_segment, switched
 from shapespace.model.networks import ModelFailedError, Patience, Session
@@ -44,7 +44,7 @@ ITERATIONS_OUTSIDE = 60
 BROKEN_TRIANGLES = 0.1
 
 
-class MeshChoice(StrEnum):
+class MeshChoice(Choice):
     """Mesh of a shape; a model without a finer mesh returns its only mesh for both."""
 
     FINE = "fine"

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,8 @@ from scipy.special import ndtr, ndtri
 
 from shapespace.arrays import FloatArray
 from shapespace.bundle.schema import Manifest
+from shapespace.counted import counted
+from shapespace.model.choice import Choice
 
 #: (n, m) codes as the networks take them; everything that identifies a shape is derived from this form.
 Codes = NDArray[np.float32]
@@ -49,7 +50,7 @@ class Fixed:
         return np.where(self.mask, self.values, x)
 
 
-class Bounds(StrEnum):
+class Bounds(Choice):
     """What to do with a code outside the bounds: extrapolate, move it to the nearest bound, or refuse it."""
 
     ALLOW = "allow"
@@ -57,7 +58,7 @@ class Bounds(StrEnum):
     REJECT = "reject"
 
 
-class Distribution(StrEnum):
+class Distribution(Choice):
     """Distribution of random codes: two inside the bounds, and the Gaussian of the training codes."""
 
     UNIFORM = "uniform"
@@ -113,7 +114,7 @@ class LatentSpace:
             if len(value) != self.dimension:
                 names = f" ({'; '.join(self.names)})" if self.dimension <= 12 else ""
                 raise WrongLengthError(
-                    f"Code {i} has {len(value)} numbers, but {self.model} takes {self.dimension}{names}. "
+                    f"Code {i} has {counted(len(value), 'number')}, but {self.model} takes {self.dimension}{names}. "
                     f"Give exactly {self.dimension}."
                 )
         with np.errstate(over="ignore"):

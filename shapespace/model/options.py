@@ -8,9 +8,9 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from enum import StrEnum
 from typing import Self
 
+from shapespace.model.choice import Choice
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
 
@@ -18,28 +18,28 @@ from shapespace.model.latent_space import Bounds
 _SEED = {"ge": 0, "lt": 2**63}
 
 
-class Objective(StrEnum):
+class Objective(Choice):
     """What ``encode`` minimises: vertex distances after rigid alignment, or differences of lengths and angles."""
 
     VERTICES = "vertices"
     NRIC = "nric"
 
 
-class PriorKind(StrEnum):
+class PriorKind(Choice):
     """Which changes of a code cost least in ``edit``: changes of few factors, or small changes of all factors."""
 
     GROUPS = "groups"
     RIDGE = "ridge"
 
 
-class ScaleChoice(StrEnum):
+class ScaleChoice(Choice):
     """Whether a scan has the size of the model's shapes, or ``fit_scan`` estimates its size."""
 
     FIXED = "fixed"
     FREE = "free"
 
 
-class Prior(StrEnum):
+class Prior(Choice):
     """Distribution of codes that ``fit_scan`` assumes: the training codes' Gaussian, or uniform in the bounds."""
 
     POPULATION = "population"
@@ -104,7 +104,7 @@ class SearchOptions:
 
     def __post_init__(self) -> None:
         for option in fields(self):
-            if isinstance(option.default, StrEnum):
+            if isinstance(option.default, Choice):
                 object.__setattr__(self, option.name, type(option.default)(getattr(self, option.name)))
 
     @classmethod

@@ -1,13 +1,13 @@
 """A decoded shape: its quality, its diagnostics, and its vertices."""
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 from shapespace.arrays import FloatArray
+from shapespace.model.choice import Choice
 from shapespace.solve.outcome import Status
 
 
-class Quality(StrEnum):
+class Quality(Choice):
     """Accuracy of a shape.
 
     ``full``: Gauss–Newton until no vertex moves. ``draft``: from face frames alone, in a fraction of the time.

@@ -276,7 +276,7 @@ FOLDERS = [
     Folder("inside out", of_all(lambda meshes: (meshes[0], meshes[1][:, ::-1])), "wound inside out"),
     Folder("unused vertices", of_all(unused), "left out 2 vertices"),
     Folder("a seam of twins", of_all(lambda meshes: twins(meshes, seam(meshes), 0)), "merged 6.. vertices into 600"),
-    Folder("a slit that nearly closes", of_all(slit), "pairs of border vertices almost coincide"),
+    Folder("a slit that nearly closes", of_all(slit), "of border vertices that almost coincide"),
     Folder("names beyond ASCII", lambda folder: write(folder, figures(), names=UMLAUTS)),
     Folder("mixed formats", mixed),
     Folder("STL", of_all(lambda meshes: meshes, "stl")),

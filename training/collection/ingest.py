@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.arrays import IntArray
+from shapespace.counted import counted
 from shapespace.training.collection.checks import (
     TOLERANCES,
     ShapeSource,
@@ -21,7 +22,7 @@ from shapespace.training.collection.checks import (
     orientation_notes,
     refusing,
 )
-from shapespace.training.collection.faults import Faults, IngestError
+from shapespace.training.collection.faults import Faults, IngestError, shown
 from shapespace.training.collection.listing import MIN_SHAPES
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.collection.parts import MeshPart, PartSelection, parts_note, select_parts
@@ -125,11 +126,11 @@ def _welding_notes(
     notes = []
     if coincidences.apart:
         notes.append(
-            f"{coincidences.apart} pairs of vertices coincide in {files.sources[0].label} but not in every shape, so "
-            "they are not merged"
+            f"did not merge {counted(coincidences.apart, 'pair')} of vertices that coincide in "
+            f"{files.sources[0].label} but not in every shape"
         )
     if total > used:
-        notes.append(f"left out {total - used} vertices that belong to no face")
+        notes.append(f"left out {counted(total - used, 'vertex', 'vertices')} without a face")
     if used > kept:
         notes.append(f"merged {used} vertices into {kept}, because the others coincide with these in every shape")
     return notes
@@ -137,7 +138,8 @@ def _welding_notes(
 
 def _seam_notes(seams: IntArray) -> list[str]:
     note = (
-        f"{len(seams)} pairs of border vertices almost coincide in every shape, to {TOLERANCES.seam:g} of the size. "
+        f"found {counted(len(seams), 'pair')} of border vertices that almost coincide in every shape, to "
+        f"{TOLERANCES.seam:g} of the size. "
         "The surface stays open there: if it should be closed, merge these vertices in all meshes"
     )
     return [note] if len(seams) else []
@@ -159,6 +161,6 @@ def _warnings(
     for warning in found:
         source = sources[warning.shape]
         vertex = f"{shapes.file_numbers[warning.vertex] + source.first}{source.counted}"
-        sentence = f"{source.label}: {warning.sentence.replace('{vertex}', vertex)}"
+        sentence = f"{shown(source.label)}: {warning.sentence.replace('{vertex}', vertex)}"
         warnings.append(replace(warning, sentence=sentence))
     return warnings

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from shapespace.counted import counted
 from shapespace.files.archives import natural_order
 from shapespace.files.reading import READ_FORMATS
 from shapespace.training.collection.checks import ShapeSource
@@ -16,7 +17,7 @@ from shapespace.training.collection.faults import Fault, IngestError, shown
 
 #: With fewer shapes a mean and modes say nothing about a collection.
 MIN_SHAPES = 3
-TOO_FEW = f"has {{}} shapes; at least {MIN_SHAPES} are needed"
+TOO_FEW = f"has {{}}; at least {MIN_SHAPES} are needed"
 #: Most names of files in one sentence.
 _MOST_NAMES = 200
 #: Extensions of files that accompany meshes, with the formats whose files may refer to them.
@@ -97,7 +98,7 @@ def mesh_files(folder: Path, file: str | None = None) -> MeshFiles:
             raise IngestError(_nothing(folder, file))
         npz = not file and extension(found.paths[0]) == "npz"
         hints = ["if one NPZ holds all shapes, name that file, not its folder"] if npz else []
-        sentence = "; ".join([TOO_FEW.format(len(found.paths)), *hints, *found.left_out])
+        sentence = "; ".join([TOO_FEW.format(counted(len(found.paths), "shape")), *hints, *found.left_out])
         raise IngestError(Fault.of(str(folder), sentence))
     return found
 

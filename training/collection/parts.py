@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.counted import counted
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, diagonal, face_areas
 from shapespace.training.collection.checks import TOLERANCES, refusing
@@ -113,9 +114,9 @@ def select_parts(
             reason = str(error)
             if not wanted and (touching := _seams_between(apart, shapes, seams)):
                 reason = (
-                    f"has {len(apart)} parts that almost meet: {touching} pairs of vertices on their borders are "
-                    f"less than {TOLERANCES.seam:g} of the mesh's size apart; merge these vertices in all meshes, or "
-                    "move the parts apart"
+                    f"has {len(apart)} parts that almost meet: {counted(touching, 'pair')} of vertices on their "
+                    f"borders are less than {TOLERANCES.seam:g} of the mesh's size apart; merge these vertices in all "
+                    "meshes, or move the parts apart"
                 )
             if wanted or not alone:
                 raise MeshError(reason) from error

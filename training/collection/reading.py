@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
+from shapespace.counted import counted
 from shapespace.files.gltf_document import can_be_posed
 from shapespace.files.limits import in_words
 from shapespace.files.npz import read_mesh_npz
@@ -276,7 +277,10 @@ def _read_morphs(path: Path) -> FileShapes:
     with refusing(ShapeSource(str(path), path.stem)):
         found = read_morph_file(path)
         if len(found.names) < MIN_SHAPES:
-            raise MeshError(f"{TOO_FEW.format(len(found.names))}: the base, and each morph target that moves vertices")
+            raise MeshError(
+                f"{TOO_FEW.format(counted(len(found.names), 'shape'))}: the base, and each morph target that moves "
+                "vertices"
+            )
     sources = tuple(ShapeSource(f"{path}: shape {name}", name) for name in found.names)
     for source, shape in zip(sources, found.vertices, strict=True):
         with refusing(source):
@@ -294,7 +298,7 @@ def _npz_arrays(path: Path) -> dict[str, np.ndarray]:
     if shapes.ndim != 3 or shapes.shape[2] != 3:
         raise MeshError(f"vertices must be an (n, V, 3) array, not of shape {shapes.shape}")
     if len(shapes) < MIN_SHAPES:
-        raise MeshError(TOO_FEW.format(len(shapes)))
+        raise MeshError(TOO_FEW.format(counted(len(shapes), "shape")))
     names = arrays.get("names", np.arange(len(shapes)))
     if names.shape != (len(shapes),) or names.dtype.kind not in "Uiu":
         raise MeshError(f"names must be ({len(shapes)},) strings, not {names.dtype} of shape {names.shape}")

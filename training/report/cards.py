@@ -7,6 +7,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.colors import to_rgb
 
+from shapespace.counted import counted
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.training.report.number_format import percent
@@ -140,12 +141,16 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
     """
     cards = []
     if (facts := record.generalisation) and "failed" not in facts:
+        how = (
+            f"{counted(facts['held_out'], 'shape')}, left out when mean and modes were found. Measured without networks"
+        )
+        if facts.get("stuck"):
+            how += f". The search for {counted(facts['stuck'], 'shape')} failed because faces collapse"
         cards.append({
             "title": "Unseen shapes",
-            "how": f"{facts['held_out']} shapes, left out when mean and modes were found. Measured without networks"
-            + (f". The search for {facts['stuck']} shapes failed because faces collapse" if facts.get("stuck") else ""),
+            "how": how,
             "figures": [
-                (f"{count:.3g} coordinates", of, components)
+                (counted(count, "coordinate"), of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
             ]
             + _converged(facts),

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from decimal import Decimal
 from typing import Any
 
 #: Most decimals of a number that is close to a whole.
@@ -36,9 +37,14 @@ def short_of(value: float, digits: int, whole: float = 1.0) -> str:
     return f"{value:.{digits}f}"
 
 
+def plain(value: float, digits: int) -> str:
+    """Format a number with some significant digits, without an exponent."""
+    return f"{Decimal(f'{value:.{digits}g}'):f}"
+
+
 def percent(value: float, digits: int = 2) -> str:
     """Format a share as a percentage with some significant digits."""
-    return f"{100 * value:.{digits}g}\N{NO-BREAK SPACE}%"
+    return f"{plain(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
 def duration(seconds: float | None) -> str:
@@ -49,10 +55,10 @@ def duration(seconds: float | None) -> str:
         return f"{1000 * seconds:.3g}\N{NO-BREAK SPACE}ms"
     for unit, length in (("h", 3600), ("min", 60)):
         if seconds >= 2 * length:
-            return f"{seconds / length:.3g}\N{NO-BREAK SPACE}{unit}"
+            return f"{plain(seconds / length, 3)}\N{NO-BREAK SPACE}{unit}"
     return f"{seconds:.3g}\N{NO-BREAK SPACE}s"
 
 
 def size(value: float) -> str:
     """Format bytes as megabytes."""
-    return f"{value / 1e6:.3g}\N{NO-BREAK SPACE}MB"
+    return f"{plain(value / 1e6, 3)}\N{NO-BREAK SPACE}MB"

@@ -5,6 +5,7 @@ from typing import Any
 
 import jinja2
 
+from shapespace.counted import counted
 from shapespace.training.report.cards import (
     accuracy_cards,
     extreme_shapes,
@@ -149,8 +150,8 @@ def _geometry(choice: dict[str, Any]) -> str:
         return f"{sentence}."
     others = [f"{percent(error)} by {GEOMETRIES[each]}" for each, error in errors.items() if each != kind]
     found = (
-        f"{sentence}. The run chose this map on {choice['held_out']} shapes that were held out in turn, with "
-        f"{choice['compared']} coordinates. The error was {percent(errors.get(kind))}"
+        f"{sentence}. The run chose this map on {counted(choice['held_out'], 'shape')}, held out in turn, with "
+        f"{counted(choice['compared'], 'coordinate')}. The error was {percent(errors.get(kind))}"
     )
     if not others:
         return f"{found}. The other maps had no mean shape."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from shapespace.counted import counted
 from shapespace.training.report.cards import SIMPLE
 from shapespace.training.report.number_format import percent
 from shapespace.training.report.record import Record
@@ -59,8 +60,8 @@ def advice(record: Record) -> Iterator[str]:
     room = 1.5 * count < 0.8 * shapes
     if own < (1 - STILL_FALLS) * half and room:
         yield (
-            f"More modes: with {count:.3g} instead of {facts['counts'][-2]:.3g} coordinates the error on unseen shapes "
-            f"fell from {percent(half)} to {percent(own)}. Try modes.count = {round(1.5 * count)}."
+            f"More modes: with {count} instead of {counted(facts['counts'][-2], 'coordinate')} the error on unseen "
+            f"shapes fell from {percent(half)} to {percent(own)}. Try modes.count = {round(1.5 * count)}."
         )
     error = record.evaluation.get("vertex_error", {}).get("mean", 0.0)
     if record.geometry.get("kind", "exponential") == "exponential" and error > NETWORKS * own:

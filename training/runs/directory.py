@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +24,10 @@ File = TypeVar("File")
 
 class NotARunError(ValueError):
     """A folder that holds something else than a run."""
+
+
+class RunInUseError(RuntimeError):
+    """A run that another process is working on."""
 
 
 class RunFile(Generic[File]):
@@ -79,6 +85,29 @@ class RunDirectory:
                 "empty or a new folder with --out"
             )
         self._stamps.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from working on the run; raise RunInUseError if one does.
+
+        The lock belongs to the operating system, which releases it however the process ends.
+        """
+        import filelock
+
+        lock, file = filelock.FileLock(self._stamps / "lock", timeout=0), TextFile(self._stamps / "process.txt")
+        try:
+            held = lock.acquire()
+        except filelock.Timeout:
+            holder = file.read() if file.exists() else "another process"
+            raise RunInUseError(
+                f"{holder} is working on the run {self.folder}: wait until it ends, or stop it"
+            ) from None
+        with held:
+            file.write(f"process {os.getpid()} on {platform.node()}")
+            try:
+                yield
+            finally:
+                file.path.unlink(missing_ok=True)
 
     def stamp(self, stage: str) -> JsonFile:
         """``key``, ``basis`` and ``version`` of a stage that has begun, and ``seconds`` once it is done.

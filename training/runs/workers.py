@@ -15,6 +15,7 @@ import pickle
 import sys
 import threading
 import time
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from queue import Empty, SimpleQueue
@@ -107,6 +108,7 @@ def _in_processes(
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    warnings.filterwarnings("ignore", message=r"\d+ tasks (which were|have been)")  # of a stage that an error ends
     left = dict(enumerate(items))
     for deaths in range(1 + RETRIES):
         # One BLAS thread from the start, for libraries that look at the environment when they are loaded.
@@ -196,7 +198,7 @@ def _client(scheduler: str) -> Client:
     try:
         from distributed import Client
     except ImportError as error:
-        raise WorkersError("a scheduler needs Dask: pip install '.[cluster]', from shapespace's folder") from error
+        raise WorkersError("a scheduler needs Dask: pip install 'shapespace[cluster]'") from error
     try:
         return Client(scheduler, timeout=CONNECT, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -8,6 +8,7 @@ import numpy as np
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.attributes import surface_arrays, surface_entry
+from shapespace.counted import counted
 from shapespace.mesh.attached_parts import attach_part
 from shapespace.mesh.coarsening import coarsen
 from shapespace.mesh.fine_detail import GAIN, RIDGES
@@ -21,7 +22,7 @@ from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.settings import NEARLY_COARSE, CollectionSettings
 from shapespace.training.space.generalisation import FOLDS
-from shapespace.training.stages.stage import Run, Stage, StageWarning, read_meshes
+from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 #: Most vertices of all fine shapes together for which fine detail is learned. It takes memory for several copies.
 MOST_DETAILED = 8_000_000
@@ -41,8 +42,8 @@ def ingest(run: Run) -> None:
     if run.by_design:
         write_reference(directory, run.collection.reference, run.collection.scale)
         return
-    meshes = read_meshes(run.config)
-    meshes.require_accepted(run.accepted)
+    meshes = run.meshes
+    del run.meshes  # they may be large
     chosen = meshes.index(settings.reference)
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
@@ -202,8 +203,8 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
         sentences.append(f"coarse mesh: {facts['reason']}")
     if facts.get("folds"):
         sentences.append(
-            f"coarse mesh: {facts['folds']} pairs of neighbouring faces are folded onto one another in some shape. "
-            f"Logarithms and samples may fail there; {REMEDY}"
+            f"coarse mesh: {counted(facts['folds'], 'pair')} of neighbouring faces that are folded onto one another in "
+            f"some shape. Logarithms and samples may fail there; {REMEDY}"
         )
     if facts.get("smallest_angle", np.inf) < LEAST_ANGLE:
         sentences.append(

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.counted import counted
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.codes import Codes, box_of, enough_steps, nearest_codes
@@ -128,7 +129,7 @@ def _warnings(run: RunDirectory) -> list[StageWarning]:
         warnings.append(StageWarning(sentence))
     if found < asked:
         why = (
-            f"{len(steps)} shapes differ in {found} directions"
+            f"{len(steps)} shapes differ in {counted(found, 'direction')}"
             if found == len(steps) - 1
             else "the others would be zero; a smaller modes.sparsity keeps more, unless it is 0 already"
         )

@@ -12,7 +12,7 @@ from shapespace.bundle.writer import require_replaceable
 from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
-from shapespace.training.runs.config import Config
+from shapespace.training.runs.config import Config, stored_data
 from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.runs.progress import stage_place
 from shapespace.training.stages import (  # fmt: skip
@@ -28,7 +28,7 @@ from shapespace.training.stages import (  # fmt: skip
     samples,
 )
 from shapespace.training.stages.results import LostFile, bundle_fault, file_facts, lost_files, written
-from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning, read_meshes
+from shapespace.training.stages.stage import TOLERATED_LOSS, Run, Stage, StageWarning
 
 _MODULES = (ingest, mean, modes, factors, samples, networks, generalisation, evaluation, export)
 STAGES: dict[str, Stage] = {name: module.STAGE for name, module in zip(STAGE_NAMES, _MODULES, strict=True)}
@@ -75,18 +75,22 @@ def execute(
     Raises:
         LostTooMuchError: more than a quarter of the logarithms or samples are lost, and ``keep_going`` is false.
         NotARunError: the run directory holds something else, or the collection's data.
+        RunInUseError: another process is working on the run.
         BundleError: the place of the bundle holds something else.
         DamagedFileError: a file was damaged, and was so again after its stage had made it anew.
     """
     repaired = set[Path]()
-    while True:
-        try:
-            return _execute(run, until, keep_going=keep_going, command=command, show=show)
-        except DamagedFileError as error:
-            if error.path in repaired:
-                raise
-            repaired.add(error.path)
-            _discard(run.directory, error.path, show)
+    run.directory.begin()
+    _refuse_own_data(run)
+    with run.directory.locked():
+        while True:
+            try:
+                return _execute(run, until, keep_going=keep_going, command=command, show=show)
+            except DamagedFileError as error:
+                if error.path in repaired:
+                    raise
+                repaired.add(error.path)
+                _discard(run.directory, error.path, show)
 
 
 def _discard(directory: RunDirectory, path: Path, show: Callable[[str], None]) -> None:
@@ -182,14 +186,20 @@ def replaces_another(run: Run) -> str:
 def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, Any]]]:
     """Remove outdated results and write the configuration. Return the keys of the stages, and facts about the data."""
     directory, source = run.directory, run.config.collection.data
-    directory.begin()
-    _refuse_own_data(run)
     data, known = _data_facts(run), directory.data.read_if_written()
     if data:  # a run from a generator has none, and is done again where it is of version 0.1
         refuse_old(directory)
     if gone := bool(source and known and not source.exists()):
         data = known
-    elif known and (changes := _changes(known, data)):
+    elif source and known and (changes := _changes(known, data)):
+        if (before := stored_data(directory.config.path)) not in (None, source) and not run.force:
+            raise IngestError(
+                Fault(
+                    str(source),
+                    f"the run {directory.folder} has the results of other meshes, {before}",
+                    "name another run directory with --out, or replace all results with --force",
+                )
+            )
         show(f"data: {changes}; all stages from ingest on run again")
     if unused := run.config.unused:
         show(
@@ -203,8 +213,8 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         show(f"data: {source} does not exist any more; the run continues with the results of ingest")
     elif gone:
         raise IngestError(Fault(str(source), "no such file or folder", "check its name"))
-    elif source and changed and "seconds" in stamp:
-        read_meshes(run.config).require_accepted(run.accepted)  # raises its errors before results are removed
+    elif changed and "seconds" in stamp and not run.by_design:
+        _ = run.meshes  # raises its errors before results are removed
     _forget(directory, keys, show)
     directory.config.write(run.source)
     return keys, data

@@ -59,6 +59,7 @@ class Run:
     """A run: its directory, its configuration with its text, the folder of bundles, and what it needs from outside.
 
     ``scheduler`` is for workers.run. `ingest` takes the shapes ``accepted`` though their size or vertex order differs.
+    If ``force``, results from other data may be replaced.
     """
 
     def __init__(
@@ -69,14 +70,23 @@ class Run:
         models: Path,
         scheduler: str | None = None,
         accepted: Sequence[str] = (),
+        *,
+        force: bool = False,
     ) -> None:
         self.directory, self.config, self.models, self.scheduler = RunDirectory(folder), config, models, scheduler
-        self.accepted, self.source = accepted, source
+        self.accepted, self.source, self.force = accepted, source, force
 
     @property
     def by_design(self) -> bool:
         """Whether the collection is a product whose generator gives factors and bounds."""
         return self.config.collection.generator in PRODUCTS
+
+    @cached_property
+    def meshes(self) -> MeshCollection:
+        """The meshes to compute with; raises the errors of `read_meshes`, and IngestError if some must be accepted."""
+        meshes = read_meshes(self.config)
+        meshes.require_accepted(self.accepted)
+        return meshes
 
     @cached_property
     def collection(self) -> Collection:

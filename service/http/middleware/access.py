@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Collection
 from http import HTTPStatus
+from urllib.parse import unquote
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
@@ -43,6 +44,18 @@ class CrossOrigin(CORSMiddleware):
         answer.headers["X-Request-ID"] = request_id_of(request_headers)
         answer.headers["X-Content-Type-Options"] = "nosniff"
         return answer
+
+
+class AcceptWholeAddress(HTTPMiddleware):
+    """Reads requests whose target is a whole address (RFC 9112, 3.2.2); its host takes the place of ``Host``."""
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, with the path alone."""
+        if found := re.match(rb"(?i)https?://([^/]+)", scope["raw_path"]):
+            scope["raw_path"] = scope["raw_path"][found.end() :] or b"/"
+            scope["path"] = unquote(scope["raw_path"].decode("ascii"))
+            scope["headers"] = [(name, found[1] if name == b"host" else value) for name, value in scope["headers"]]
+        await self.app(scope, receive, send)
 
 
 class RequireHost(HTTPMiddleware):

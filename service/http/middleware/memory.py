@@ -15,6 +15,8 @@ from shapespace.service.limits.quota import UPLOADS, Quota, QuotaError
 UNREAD_BYTES = 256 * 2**20
 #: Bytes of an answer that are sent at once, and of a compressed body that are unpacked at once.
 PIECE_BYTES = 2**18
+#: Most members of a gzip body (RFC 1952, 2.2): an empty member has few bytes, but costs as much as a large one.
+MOST_MEMBERS = 4000
 #: Window sizes by which zlib tells the formats of ``Content-Encoding``.
 WINDOWS = {"gzip": 16 + zlib.MAX_WBITS, "x-gzip": 16 + zlib.MAX_WBITS, "deflate": zlib.MAX_WBITS}
 
@@ -76,27 +78,41 @@ class _Unpacked:
     """The messages of a compressed body, unpacked in pieces of a size that holds up no other request."""
 
     def __init__(self, receive: Receive, window: int) -> None:
-        self._receive = receive
+        self._receive, self._window = receive, window
         self._unpacker = zlib.decompressobj(window)
+        self._members = MOST_MEMBERS if window > zlib.MAX_WBITS else 1
+        self._packed = b""  # what is received and not unpacked yet
         self._more = True  # whether further messages follow
         self._full = False  # whether the last piece was as large as pieces may be, so that more may be left of it
 
     async def __call__(self) -> Message:
-        packed = self._unpacker.unconsumed_tail
         if not self._full:
             message = await self._receive()
             if message["type"] != "http.request":
                 return message
-            packed, self._more = message.get("body", b""), message.get("more_body", False)
+            self._packed, self._more = message.get("body", b""), message.get("more_body", False)
         try:
-            body = self._unpacker.decompress(packed, PIECE_BYTES)
+            body = self._piece()
         except zlib.error:
             raise _damaged() from None
         self._full = len(body) == PIECE_BYTES
         more = self._more or self._full
-        if self._unpacker.unused_data or not (more or self._unpacker.eof):
+        if not (more or self._unpacker.eof):
             raise _damaged()
         return {"type": "http.request", "body": body, "more_body": more}
+
+    def _piece(self) -> bytes:
+        """Unpack the next piece, over the ends of members."""
+        body = bytearray()
+        while True:
+            if self._packed and self._unpacker.eof:
+                self._unpacker, self._members = zlib.decompressobj(self._window), self._members - 1
+                if not self._members:
+                    raise _damaged()
+            body += self._unpacker.decompress(self._packed, PIECE_BYTES - len(body))
+            self._packed = self._unpacker.unused_data or self._unpacker.unconsumed_tail
+            if not self._packed or len(body) == PIECE_BYTES:
+                return bytes(body)
 
 
 class LimitUnreadAnswers(HTTPMiddleware):

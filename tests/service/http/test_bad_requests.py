@@ -6,6 +6,9 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.service.conftest import Server
+from tests.service.wire import exchange
+
 JSON = {"Content-Type": "application/json"}
 MODEL = "/v1/models/small"
 MESH, VERTICES, NRIC, PATHS = (f"{MODEL}/{call}" for call in ("mesh", "vertices", "nric", "interpolations"))
@@ -75,12 +78,12 @@ REQUESTS = {
     "empty code in a link": get(f"{MESH}?latent=", 422, "wrong-length", "Give exactly 3"),
     "no code": post(VERTICES, {"latents": []}, 422, "invalid-request", "Send at least one code"),
     "one code for many": post(VERTICES, {"latents": OK}, 422, "invalid-request", "Send a list for latents[0]"),
-    "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "codes of two lengths": post(VERTICES, {"latents": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 number,"),
     "too many codes": post(VERTICES, {"latents": [OK] * 21}, 422, "too-many-codes", "Send several requests"),
     "too many codes for NRIC": post(NRIC, {"latents": [OK] * 21}, 422, "too-many-codes", "the limit is 20"),
     "factors as text": post(NRIC, {"latents": [OK], "factors": "yes"}, 422, "invalid-request", "true or false"),
     "one keyframe": post(PATHS, {"keyframes": [OK]}, 422, "invalid-request", "2 or more entries for keyframes"),
-    "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 numbers"),
+    "short keyframe": post(PATHS, {"keyframes": [OK, [1]]}, 422, "wrong-length", "Code 1 has 1 number,"),
     "times run back": post(
         PATHS, {"keyframes": [OK, OK, OK], "times": [0, 2, 1]}, 422, "invalid-request", "times must increase"
     ),
@@ -202,3 +205,18 @@ def test_every_fault_of_a_body_is_listed(client: httpx.Client) -> None:
         client.post(MESH, json=body).json()["errors"][-1]["pointer"] for body in ([], {"latent": OK, "a/b~": 1})
     ]
     assert pointers == ["#", "#/a~1b~0"]
+
+
+@pytest.mark.parametrize(
+    ("target", "status"),
+    [
+        ("http://localhost:1/v1/models/small/mesh?format=stl", b"200"),
+        ("HTTPS://127.0.0.1/v1/models/%73mall", b"200"),
+        ("http://localhost", b"200"),
+        ("http://localhost/v1/models?a=b", b"422"),
+        ("http://a.example/v1/models/small", b"421"),  # although the header names this server
+    ],
+)
+def test_a_target_may_be_a_whole_address(target: str, status: bytes, server: Server) -> None:
+    answer = exchange(server, f"GET {target} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
+    assert answer.split()[1] == status, answer[:500]

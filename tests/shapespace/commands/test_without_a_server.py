@@ -78,6 +78,17 @@ def test_the_list_has_models_here_and_installed_models(shell: Shell) -> None:
     assert ["figure", "4", "20", "MIT"] in [row[:4] for row in rows]
 
 
+def test_a_variable_names_the_folder_of_models(
+    shell: Shell, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").mkdir()
+    for place, code in ((folder / "models", 0), ("", 1)):
+        monkeypatch.setenv("SHAPESPACE_MODELS_DIR", str(place))
+        assert ("small " in shell("models")) is (code == 0)
+        shell("decode", "small", "--out", tmp_path / "shape.glb", code=code)
+
+
 def test_random_codes_become_files_with_a_table(shell: Shell, model: ShapeModel, tmp_path: Path) -> None:
     out = tmp_path / "new" / "shapes"
     shell("decode", "small", "--random", "11", "--seed", "3", "--out", out, "--mesh", "coarse")
@@ -133,7 +144,7 @@ def test_meshes_become_a_table_and_a_bad_one_stops_nothing(shell: Shell, model: 
     (tmp_path / "odd.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     files = [tmp_path / name for name in ("a.ply", "odd.obj", "none.ply", "b.ply")]
     good, odd, none, poor = table(shell("encode", "small", *files, "--fixed", '{"2": 0.4}', code=1))
-    assert "2 of 4 files have no code" in shell.err
+    assert "no code for 2 of 4 files" in shell.err
     assert (good["status"], good["inside_bounds"]) == ("converged", "True")
     assert good["file"] == str(files[0])
     np.testing.assert_allclose([float(good[name]) for name in model.names], [0.1, 0.7, 0.4], atol=1e-3)
@@ -166,8 +177,13 @@ def test_a_scan_becomes_a_shape_on_the_scan(shell: Shell, model: ShapeModel, tmp
     assert found["placement"]["scale"] == 1
     placed = expected.placement(expected.shape.vertices)
     np.testing.assert_array_equal(read_arrays(out)[0], placed.astype(np.float32))
+    assert ("look at the fitted shape" in shell.err) is (found["status"] != "converged")
     shell(*command, code=1)
     assert "exists already" in shell.err
+    assert shell(*command, "--force", "--deadline", "1e-9").startswith("deadline: ")
+    assert "The status is deadline: look at the fitted shape" in shell.err
+    shell(*command, "--force", "--deadline", "1e-9", "--samples", "9" * 15, code=1)
+    assert "there is not enough memory" in shell.err
 
 
 def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> None:
@@ -192,9 +208,11 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
         ("page small --out site", 1, "small has no decoder.onnx, which computes shapes in the browser"),
         ("page small --out plain", 1, "plain is a file; name a folder"),
+        ("page figure --out -", 2, "'--out': the results can't go to standard output; name a file or folder"),
+        ("run a.toml --models -", 2, "'--models': the results can't go to standard output"),
         ("fit small a.ply --out fitted", 1, "fitted has no extension, which tells the format"),
         ("fit small a.ply --json plain", 1, "plain: exists already"),
-        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 numbers, but small takes 3 ("),
+        ("decode small --latent 0.1 --out x.glb", 1, "Code 0 has 1 number, but small takes 3 ("),
         ("decode small --latent 9,0,0 --bounds reject --out x.glb", 1, "Move it inside"),
         ("decode small --latent 1,x,2 --out x.glb", 2, "is not a list of numbers"),
         ("decode small --latent 1,2,3 --random 2 --out x", 2, "choose --latent or --random"),
@@ -212,6 +230,10 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("fit small -", 1, "-: can't be read: standard input is not read; save its content in a file first"),
         ("fit small /dev/null", 1, "/dev/null: can't be read: it is a device or a pipe; save its content in a file"),
         ("fit small none.ply --noise 0", 2, "--noise"),
+        ("fit small none.ply --deadline soon", 2, "'--deadline': 'soon' is not a number."),
+        ("fit small none.ply --fixed 1", 2, "'--fixed': needs an object."),
+        ("fit small none.ply --landmarks [{\"vertex\":1,\"position\":[0,0,0],\"sgima\":1}]", 2, "0.sgima: there is no"),
+        ("fit small none.ply --out - --json -", 2, "--out and --json name one file: name two."),
         ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "0.position: is not there; add it"),
         ("fit small none.ply --out", 2, "requires an argument"),
         ("fit small a.ply b.ply", 2, "unexpected extra argument"),

@@ -109,7 +109,7 @@ MESH_REFUSALS = {
     "flat list": ([0, 1, 2], "vertices must be a (V, 3) array, not of shape (3,)"),
     "planar": ([[0, 0], [1, 0], [0, 1], [1, 1]], "vertices must be a (V, 3) array, not of shape (4, 2)"),
     "too few": (CORNERS[:3], "faces name vertices 0 to 3, but there are 3 vertices"),
-    "too many": ([*CORNERS, [1, 1, 1]], "vertex 4 belongs to no face (1 such vertices)"),
+    "too many": ([*CORNERS, [1, 1, 1]], "vertex 4 belongs to no face (1 such vertex)"),
     "not a number": (changed(2, [0, np.nan, 0]), "vertex 2 has a coordinate that is not finite"),
     "infinite": (changed(1, [0, 0, -np.inf]), "vertex 1 has a coordinate that is not finite"),
     "needle": (changed(3, [0.5, 0, 0]), "face 1 has no area (1 such faces)"),

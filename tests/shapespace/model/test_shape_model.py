@@ -173,7 +173,7 @@ def test_models_are_known_by_name_in_any_folder(models: Path, tmp_path: Path, mo
     assert (listed["small"].version, listed["small"].dimension) == ("10", 3)
     assert listed["figure"].folder == tmp_path / "models" / "figure" / "7"
     assert load("small").manifest.version == "10"
-    for unknown in ("figur", "small/3"):
+    for unknown in ("figur", "small/3", "Figure", "my figure"):
         with pytest.raises(BundleError, match=f"no model {unknown} here: choose among figure, freaky-torus, small, or"):
             load(unknown)
     for folder in ("models/figur", "../figure", "figure/4/5"):
@@ -220,7 +220,7 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
         model.decode(np.zeros((1, 1, 3)))
     with pytest.raises(OutOfBoundsError):
         model.decode([0, 0, 2], bounds="reject")
-    with pytest.raises(ValueError, match="'large' is not a valid MeshChoice"):
+    with pytest.raises(ValueError, match="'large' is not a valid MeshChoice: choose among fine, coarse"):
         model.decode(CODES, mesh="large")  # type: ignore[arg-type]
     with pytest.raises(InvalidMeshError, match=r"\(V, 3\)"):
         model.encode(np.zeros(3))

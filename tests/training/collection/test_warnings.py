@@ -157,6 +157,14 @@ def test_a_file_s_name_may_have_braces(tmp_path: Path) -> None:
         read_collection(folder)
 
 
+def test_a_file_s_name_is_on_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "meshes"
+    write(folder, np.stack([*SHAPES[:3], SHAPES[2]]), format="obj")
+    (folder / "bar3.obj").rename(folder / "two\nlines.obj")
+    (warning,) = read_collection(folder).warnings
+    assert r"two\nlines.obj: is the same shape" in warning.sentence
+
+
 @pytest.mark.parametrize("name", ["bar0.obj", "bar3.obj"])
 @pytest.mark.parametrize(
     ("keep", "says"),

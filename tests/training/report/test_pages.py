@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import bundled, few_shapes, fit, generalisation, pages, results, served, stages, verdict
-from shapespace.training.report.number_format import r2, short_of
+from shapespace.training.report.number_format import duration, percent, r2, short_of, size
 from shapespace.training.runs.provenance import made_by
 
 WRITERS: dict[str, Callable[[], None]] = {
@@ -59,6 +59,13 @@ def test_figures_are_written_with_what_made_them(tmp_path: Path) -> None:
 def test_no_r2_rounds_up_to_one(value: float, text: str) -> None:
     assert r2(value) == text
     assert short_of(100 * value, 1, 100) != "100.0" or value == 1
+
+
+def test_numbers_have_no_exponents() -> None:
+    shown = [*map(percent, (3e-8, 0.00123, 1.0, 12.34)), size(2.34e9), duration(4e6)]
+    assert [each.replace("\N{NO-BREAK SPACE}", " ") for each in shown] == [
+        "0.000003 %", "0.12 %", "100 %", "1200 %", "2340 MB", "1110 h",
+    ]  # fmt: skip
 
 
 def test_the_verdict_and_its_chart_are_what_the_runs_say() -> None:

@@ -68,7 +68,7 @@ def test_data_lie_relative_to_the_configuration(written: str, tmp_path: Path, mo
 
 def test_the_command_s_arguments_go_before_the_file_and_into_the_text_that_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
-    file.write_text("# kept\n" + TINY.replace('generator = "freaky-torus"', 'data = "old"', 1))
+    file.write_text("\ufeff# kept\n" + TINY.replace('generator = "freaky-torus"', 'data = "old"', 1))
     config, text = load(file, tmp_path / "new")
     assert config.collection.data == tmp_path / "new"
     assert text.startswith("# kept")

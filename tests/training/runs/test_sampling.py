@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -127,6 +128,8 @@ def test_a_killed_process_costs_nothing_but_what_kills_all_ends_the_run(
     found = list(workers.run(partial(die_once, tmp_path / "dead"), range(5), workers=2))
     assert (tmp_path / "dead").exists()
     assert sorted(found) == [(k, k**2) for k in range(5)]
+    with closing(workers.run(abs, range(50), workers=2)) as some:
+        assert next(iter(some))[0] < 50, "and what is left undone causes no warning"
     with pytest.raises(WorkersError, match="killed several times"):
         list(workers.run(signal.raise_signal, [signal.SIGKILL] * 2, workers=2))
 

@@ -129,7 +129,17 @@ def test_changed_data_are_read_again_and_it_is_said(place: Path, said: Said) -> 
     assert "ingest: done before" in words
     said(*run, "--data", "misspelt", code=1)
     assert "misspelt: no such file or folder; check its name" in said.errors
+    (place / "other").mkdir()
+    for k in (1, 2, 3):
+        write(place / "other" / f"bar{k}.obj", SHAPES[k])
+    said(*run, "--data", "other", code=1)
+    assert "other: the run runs/bars has the results of other meshes" in said.errors
     assert "ingest: done before" in said(*run), "nothing was removed"
+    assert "data: 2 removed (bar0.obj, bar9.obj)" in said(*run, "--data", "other", "--force")
+    assert "ingest: done before" in said(*run, "--data", "other")
+    (place / "bars.toml").write_text(CONFIG.replace('data = "bars.npz"', ""))
+    assert "collection.data is missing" in said(*run, code=1)
+    assert "ingest         done" in said("status", "runs/bars")
 
 
 def test_a_run_of_version_0_1_is_not_continued_and_loses_nothing(place: Path, said: Said) -> None:
@@ -204,6 +214,12 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_nobody_disturbed(place: Path,
     while not list(place.glob("killed/samples/part-*.npz")):
         assert process.poll() is None, "the run ended before it could be killed"
         time.sleep(0.001)
+    os.killpg(process.pid, signal.SIGSTOP)
+    before = {path: path.read_bytes() for path in (place / "killed").rglob("*") if path.is_file()}
+    for other in (killed, ("export", "killed")):
+        (sentence,) = said(*other, code=1).splitlines()
+        assert re.search(rf": process {process.pid} on \S+ is working on the run killed: wait until", sentence)
+    assert {path: path.read_bytes() for path in (place / "killed").rglob("*") if path.is_file()} == before
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     said(*whole)
