@@ -103,7 +103,6 @@ COMMANDS = (
                 is_flag=True,
                 help="continue even if more than a quarter of the logarithms or samples fail",
             ),
-            click.Option(["--force"], is_flag=True, help="replace the results of other meshes"),
             _MODELS,
         ],
         ["meshes.toml", "meshes.toml --until modes", "meshes.toml --accept bar3.obj --out runs/again"],

@@ -143,13 +143,12 @@ def run(
     scheduler: str | None,
     accept: Sequence[str],
     keep_going: bool,
-    force: bool,
     models: Path,
 ) -> None:
     """Train the model of a configuration."""
     folder = _folder(config, out)
     settings, source = load(config, data, RunDirectory(folder).config.path)
-    begun = Run(folder, settings, source, models, scheduler, accept, force=force)
+    begun = Run(folder, settings, source, models, scheduler, accept)
     again = " ".join([_program(), *map(shlex.quote, sys.argv[1:])])
     _execute(begun, until, keep_going=keep_going, command=again)
     if until not in (None, "export"):

@@ -130,24 +130,12 @@ def load(path: Path, data: Path | None = None, stored: Path | None = None) -> tu
     return config, tomlkit.dumps(document)
 
 
-def stored_data(stored: Path) -> Path | None:
-    """Return ``collection.data`` of the configuration in a run directory; None if it has none, or can't be read."""
-    data = _stored(stored).get("collection", {}).get("data")
-    return Path(data) if data else None
-
-
 def _is_of_0_2(stored: Path) -> bool:
     """Return whether a run directory has a configuration, without a first step."""
-    tables = _stored(stored)
-    return bool(tables) and "first_step" not in tables.get("exponential", {})
-
-
-def _stored(path: Path) -> dict[str, Any]:
-    """Return the tables of the configuration in a run directory; none if it can't be read."""
     try:
-        return tomllib.loads(read_plain(path).decode())
+        return "first_step" not in tomllib.loads(read_plain(stored).decode()).get("exponential", {})
     except (OSError, ValueError):
-        return {}
+        return False
 
 
 def _load(path: Path, data: Path | None = None) -> tuple[Config, str]:

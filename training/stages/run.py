@@ -12,7 +12,7 @@ from shapespace.bundle.writer import require_replaceable
 from shapespace.training.collection.faults import Fault, IngestError
 from shapespace.training.collection.listing import data_files
 from shapespace.training.runs.atomic_files import DamagedFileError
-from shapespace.training.runs.config import Config, stored_data
+from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import NotARunError, RunDirectory
 from shapespace.training.runs.progress import stage_place
 from shapespace.training.stages import (  # fmt: skip
@@ -192,14 +192,6 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
     if gone := bool(source and known and not source.exists()):
         data = known
     elif source and known and (changes := _changes(known, data)):
-        if (before := stored_data(directory.config.path)) not in (None, source) and not run.force:
-            raise IngestError(
-                Fault(
-                    str(source),
-                    f"the run {directory.folder} has the results of other meshes, {before}",
-                    "name another run directory with --out, or replace all results with --force",
-                )
-            )
         show(f"data: {changes}; all stages from ingest on run again")
     if unused := run.config.unused:
         show(

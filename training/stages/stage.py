@@ -59,7 +59,6 @@ class Run:
     """A run: its directory, its configuration with its text, the folder of bundles, and what it needs from outside.
 
     ``scheduler`` is for workers.run. `ingest` takes the shapes ``accepted`` though their size or vertex order differs.
-    If ``force``, results from other data may be replaced.
     """
 
     def __init__(
@@ -70,11 +69,9 @@ class Run:
         models: Path,
         scheduler: str | None = None,
         accepted: Sequence[str] = (),
-        *,
-        force: bool = False,
     ) -> None:
         self.directory, self.config, self.models, self.scheduler = RunDirectory(folder), config, models, scheduler
-        self.accepted, self.source, self.force = accepted, source, force
+        self.accepted, self.source = accepted, source
 
     @property
     def by_design(self) -> bool:
