@@ -22,7 +22,7 @@ from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnsw
 from shapespace.service.http.middleware.observe import QUIET, Observe
 from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
-from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox import READ, Sandbox
 from shapespace.service.limits.workers import Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
@@ -64,8 +64,8 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
             connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
             answers = AnswerCache(settings.cache)
-            sandbox = Sandbox(min(settings.workers, UPLOADS))
-            sandbox.prepare("read")
+            sandbox = Sandbox(min(settings.workers, UPLOADS), READ)
+            sandbox.prepare()
             app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
             # Threads that read bodies and folders, apart from the workers.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))

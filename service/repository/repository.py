@@ -13,7 +13,7 @@ from shapespace.bundle.reader import BundleError, check_place, manifest_digest, 
 from shapespace.files.limits import in_words
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.process_memory import trim_heap
-from shapespace.service.limits.sandbox_errors import (
+from shapespace.service.limits.sandbox_messages import (
     ClosedError,
     DiedError,
     FailedError,

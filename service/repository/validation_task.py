@@ -10,8 +10,7 @@ from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.files.limits import in_words
 from shapespace.model.decoder import Decoder
 from shapespace.service.limits.sandbox_child import raise_memory_limit
-from shapespace.service.limits.sandbox_errors import FailedError
-from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
+from shapespace.service.limits.sandbox_messages import Arrays, FailedError, JsonObject
 from shapespace.solve.cholesky import SymmetricPattern, analyse
 
 #: Bytes that the solver may take for each vertex of the coarse mesh, about twice its need.

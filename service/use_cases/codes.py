@@ -16,7 +16,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
-from shapespace.service.limits.sandbox_errors import (
+from shapespace.service.limits.sandbox_messages import (
     ClosedError,
     FailedError,
     LateError,
@@ -282,7 +282,7 @@ def read_upload(
     """Read the meshes of an uploaded file, and the fields of the form, in a process of its own.
 
     Args:
-        sandbox: sandbox whose child processes know the task ``read``.
+        sandbox: sandbox with the task READ.
         upload: file; reading empties it.
         limits: limits of the mesh.
         deadline: time limit of the child process.
@@ -306,7 +306,7 @@ def read_upload(
     together = limits if most == 1 else TOGETHER
     size = 24 * (together.vertices + together.faces) + _ANSWER
     try:
-        said, arrays = sandbox.call("read", facts, upload.pieces, deadline=deadline, memory=memory, most=size)
+        said, arrays = sandbox.call(facts, upload.pieces, deadline=deadline, memory=memory, most=size)
     except FailedError as error:
         if error.kind in UPLOAD_ERRORS:
             raise UPLOAD_ERRORS[error.kind](error.sentence) from None

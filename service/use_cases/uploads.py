@@ -22,8 +22,7 @@ from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.recognition import Assumed, FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.limits.sandbox_errors import FailedError
-from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
+from shapespace.service.limits.sandbox_messages import Arrays, FailedError, JsonObject
 from shapespace.service.use_cases.forms import (
     LONGEST_HEADER,
     FormFieldError,

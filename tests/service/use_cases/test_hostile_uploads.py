@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from shapespace.files.limits import Limits
-from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox import READ, Sandbox
 from shapespace.service.use_cases.codes import Upload, read_upload
 from shapespace.service.use_cases.uploads import UploadError
 from shapespace.solve.deadline import Deadline
@@ -35,7 +35,7 @@ LIMITS = Limits(2**15, 2**16)
 
 @pytest.fixture(scope="module")
 def sandbox() -> Iterator[Sandbox]:
-    with Sandbox(1) as sandbox:
+    with Sandbox(1, READ) as sandbox:
         yield sandbox
 
 
