@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 
 from fastapi import Depends, FastAPI
+from prometheus_client import CollectorRegistry
 from starlette.middleware import Middleware
 
 from shapespace import __version__
@@ -60,7 +61,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
                 settings.default_versions,
                 settings.default_versions_file,
             )
-            metrics = Metrics(repository, workers, connections.quota)
+            metrics = Metrics(app.state.metrics, repository, workers, connections.quota)
             connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
             answers = AnswerCache(settings.cache)
@@ -93,6 +94,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         redoc_url=None,
         openapi_url=None,
     )
+    app.state.metrics = CollectorRegistry()
     error_handlers.install(app)
     calls = (models, shapes, codes, interpolations, open_inference, operation, page)
     routers = [module.router for module in calls]

@@ -38,9 +38,9 @@ async def ready(service: ServiceDependency) -> Readiness:
         200: {"description": "Prometheus's text format.", "content": {"text/plain": {"schema": {"type": "string"}}}}
     },
 )
-async def metrics(service: ServiceDependency) -> Response:
+async def metrics(request: Request) -> Response:
     """Metrics of the server since its start."""
-    return Response(generate_latest(service.metrics.registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(request.app.state.metrics), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @router.get("/openapi.json", include_in_schema=False)
