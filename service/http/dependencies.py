@@ -57,7 +57,16 @@ async def _service(request: Request) -> Service:
 ServiceDependency = Annotated[Service, Depends(_service)]
 
 
-async def _caller(request: Request) -> Caller:
+@dataclass(frozen=True)
+class Asked:
+    """A request, its caller, and the service that it is for."""
+
+    service: Service
+    request: Request
+    caller: Caller
+
+
+async def _asked(request: Request) -> Asked:
     async def gone() -> Exception:
         try:
             while (await request.receive())["type"] != "http.disconnect":
@@ -66,13 +75,16 @@ async def _caller(request: Request) -> Caller:
             return error
         return DisconnectedError("The client closed the connection before its answer was ready.")
 
-    return Caller(client_name(request.client.host) if request.client else "", gone)
+    service = await _service(request)
+    client = client_name(request.client.host) if request.client else ""
+    return Asked(service, request, Caller(service.workers, client, gone))
 
 
-CallerDependency = Annotated[Caller, Depends(_caller)]
+AskedDependency = Annotated[Asked, Depends(_asked)]
 
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
-MeshQuery = Annotated[
+MeshQuery = Annotated[MeshChoice, Query(alias="mesh", description="Which mesh to answer, if the model has a fine one.")]
+MeshOfBody = Annotated[
     MeshChoice | None, Query(alias="mesh", description="Overrides `mesh` in the body: `fine` or `coarse`.")
 ]
 QualityQuery = Annotated[

@@ -24,8 +24,9 @@ from shapespace.service.limits.sandbox_messages import (
     OutOfMemoryError,
     SandboxError,
 )
-from shapespace.service.limits.workers import BusyError, Call, Caller, DeadlineError, EndingError, Workers
-from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.limits.workers import BusyError, Call, Caller, DeadlineError, EndingError
+from shapespace.service.tracing import record_stages
+from shapespace.service.use_cases.batch import EncodedFile, Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
 from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_ERRORS, UnusableMeshError, UploadedMesh
 from shapespace.solve.deadline import Deadline
@@ -50,19 +51,6 @@ Answered = tuple[dict[str, Any], Timings]
 
 
 @dataclass(frozen=True)
-class Found:
-    """Result of a search.
-
-    Attributes:
-        content: answer as JSON.
-        seconds: time by stage.
-    """
-
-    content: bytes
-    seconds: Timings
-
-
-@dataclass(frozen=True)
 class Upload:
     """An uploaded mesh file.
 
@@ -84,13 +72,12 @@ Asked = Callable[[Mapping[str, str]], tuple[ShapeModel, K]]
 
 
 async def encode(
-    workers: Workers,
-    sandbox: Sandbox,
     caller: Caller,
+    sandbox: Sandbox,
     asked: Asked[EncodeOptions],
     upload: Upload,
     most: int,
-) -> Found:
+) -> EncodedFile:
     """Find the code of an uploaded mesh in correspondence, with at most ``most`` samples; see ShapeModel.encode.
 
     An archive may hold up to ``most`` meshes. The answer then has the code of each, with the name of its file.
@@ -111,23 +98,23 @@ async def encode(
 
     model, _ = checked({})  # refused before the file is read
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        meshes, fields = read_upload(sandbox, upload, limits(model.decoder), deadline, most=most)
+        meshes, fields = read_upload(sandbox, upload, limits(model.decoder), call, most=most)
         chosen, options = checked(fields)
         read = time.perf_counter()
         answers = []
         for mesh in meshes:
-            answers.append(_encoded(chosen, mesh, options, deadline))
+            answers.append(_encoded(chosen, mesh, options, call))
             if len(meshes) > 1 and answers[-1]["status"] == Status.DEADLINE:
-                raise workers.late(f"Send fewer meshes at once. {_LATER}")
+                raise call.late(f"Send fewer meshes at once. {_LATER}")
         seconds = {"read": read - began, "search": time.perf_counter() - read}
         if len(meshes) == 1:
             return answers[0], seconds
         named = [{"name": mesh.name, **answer} for mesh, answer in zip(meshes, answers, strict=True)]
         return {"meshes": named}, seconds
 
-    return await _searched(workers, caller, _LATER, make)
+    return await _searched(caller, _LATER, make)
 
 
 def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, deadline: Deadline) -> dict[str, Any]:
@@ -156,14 +143,13 @@ def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, dead
 
 
 async def edit(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latent: Sequence[float],
     targets: Sequence[Target],
     options: EditOptions,
     most: int,
-) -> Found:
+) -> EncodedFile:
     """Find the code from ``latent`` on that brings vertices to targets, with at most ``most`` samples.
 
     See ShapeModel.edit.
@@ -180,9 +166,9 @@ async def edit(
     model.latents.code(latent, Bounds.CLAMP)
     model.latents.fixed(options.fixed)
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        found = model.edit(latent, targets, options, deadline=deadline)
+        found = model.edit(latent, targets, options, deadline=call)
         seconds = {"search": time.perf_counter() - began}
         content = {
             "latent": found.code,
@@ -197,17 +183,16 @@ async def edit(
         }
         return content, seconds
 
-    return await _searched(workers, caller, _LATER, make)
+    return await _searched(caller, _LATER, make)
 
 
 async def fit(
-    workers: Workers,
-    sandbox: Sandbox,
     caller: Caller,
+    sandbox: Sandbox,
     asked: Asked[FitOptions],
     upload: Upload,
     progress: Callable[[float], None] | None = None,
-) -> Found:
+) -> EncodedFile:
     """Find the code, placement and size that explain an uploaded scan; see ShapeModel.fit_scan.
 
     ``progress`` is called in the thread that computes.
@@ -217,18 +202,18 @@ async def fit(
         BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
+        meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, call, points=True, memory=SCAN_MEMORY)
         model, options = asked(fields)
         read = time.perf_counter()
-        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline, progress=progress)
+        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=call, progress=progress)
         return found.answer(), {"read": read - began, "search": time.perf_counter() - read}
 
-    return await _searched(workers, caller, _SMALLER, make)
+    return await _searched(caller, _SMALLER, make)
 
 
-async def events(search: Callable[[Callable[[float], None]], Awaitable[Found]]) -> AsyncGenerator[bytes, None]:
+async def events(search: Callable[[Callable[[float], None]], Awaitable[EncodedFile]]) -> AsyncGenerator[bytes, None]:
     """Yield the progress of a search as JSON, and its answer as the last; raises the error of the search."""
     loop = asyncio.get_running_loop()
     waiting = asyncio.Queue[bytes | None]()
@@ -241,24 +226,27 @@ async def events(search: Callable[[Callable[[float], None]], Awaitable[Found]]) 
     try:
         while (event := await waiting.get()) is not None:
             yield event
-        yield (await work).content
+        content = (await work).content
+        assert isinstance(content, bytes)  # noqa: S101 - narrows the type
+        yield content
     finally:
         work.cancel()
 
 
-async def _searched(workers: Workers, caller: Caller, advice: str, make: Callable[[Deadline], Answered]) -> Found:
+async def _searched(caller: Caller, advice: str, make: Callable[[Call], Answered]) -> EncodedFile:
     """Run a search, which answers its best result so far at its deadline; ``advice`` is for one without a result."""
 
-    def search(call: Call) -> Found:
+    def search(call: Call) -> EncodedFile:
         if call.passed:
-            raise workers.late(advice)
+            raise call.late()
         call.searching = True
         content, seconds = make(call)
-        return Found(dump_json(content), seconds)
+        record_stages(seconds)
+        return EncodedFile(dump_json(content), seconds)
 
-    async with workers.admit(replace(caller, long=True), advice) as call:
+    async with replace(caller, long=True).admit(advice) as call:
         try:
-            return await workers.run(search, call)
+            return await call.run(search)
         except asyncio.CancelledError:
             call.call_off()  # nobody reads the answer
             raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -21,9 +20,9 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, Codes
 from shapespace.model.memory import Examples
-from shapespace.model.shape import Diagnostics, Quality, Shape
+from shapespace.model.shape import Diagnostics, Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import Call, Caller, Workers
+from shapespace.service.limits.workers import Call, Caller
 from shapespace.service.use_cases.batch import (
     Batch,
     EncodedFile,
@@ -43,7 +42,6 @@ from shapespace.service.use_cases.shape_formats import (
     json_pieces,
     summarise,
 )
-from shapespace.solve.deadline import Deadline
 
 #: Most vertices of all shapes of one answer together: 48 MiB of positions.
 MOST_VERTICES = 2**22
@@ -67,7 +65,6 @@ class ShapeBatch:
 
 
 async def vertices_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: Sequence[Sequence[float]],
@@ -93,7 +90,7 @@ async def vertices_file(
         require_tangent_space(model.decoder)
     codes, inside = model.latents.codes(latents, bounds)
     caller = replace(caller, long=exponentials)
-    async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
+    async with batch(caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
         if place:
@@ -125,7 +122,6 @@ WriteOutputs = Callable[[Mapping[str, NDArray[np.float32]]], tuple[Iterator[Buff
 
 
 async def infer(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: NDArray[np.floating],
@@ -145,7 +141,7 @@ async def infer(
             f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes."
         )
     caller = replace(caller, long=len(codes) > SHORT_INFERENCE)
-    async with batch(workers, caller, size) as work:
+    async with batch(caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
         found: ShapeBatch | None = None
         for name in outputs:
@@ -197,7 +193,7 @@ async def shapes(
     def find(some: slice, call: Call) -> list[tuple[Diagnostics, Timings]]:
         found = []
         own = examples if isinstance(examples, bool) else examples[some]
-        solved = solve_all(work.workers, model, mesh, quality, (codes[some], inside[some]), call, own)
+        solved = solve_all(call, model, mesh, quality, (codes[some], inside[some]), own)
         for k, shape in enumerate(solved, some.start):
             vertices[k] = shape.vertices
             found.append((shape.diagnostics, shape.seconds))
@@ -221,10 +217,8 @@ async def _exponentials(
     return await work.map(one, zip(codes, found.vertices, strict=True))
 
 
-async def blend_shapes_file(
-    workers: Workers, caller: Caller, model: ShapeModel, mesh: MeshChoice
-) -> tuple[bytes, Timings]:
-    """Return a GLB with a morph target for each bound of each coordinate, and its time by stage.
+async def blend_shapes_file(caller: Caller, model: ShapeModel, mesh: MeshChoice) -> EncodedFile:
+    """Return a GLB with a morph target for each bound of each coordinate.
 
     Raises:
         PeriodicError: a coordinate is periodic, so that it has no bounds.
@@ -234,23 +228,19 @@ async def blend_shapes_file(
     require_ends(model.decoder)
     size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)
 
-    def shape(deadline: Deadline, code: Codes) -> Shape:
-        return solve(workers, model, mesh, Quality.FULL, (code, True), deadline)
-
-    def make(deadline: Deadline) -> tuple[bytes, Timings]:
+    def make(call: Call) -> EncodedFile:
         began = time.perf_counter()
-        found = blend_shapes(model.decoder, mesh, partial(shape, deadline))
+        found = blend_shapes(model.decoder, mesh, lambda code: solve(call, model, mesh, Quality.FULL, (code, True)))
         solved = time.perf_counter()
         content = found.glb()
-        return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
+        return EncodedFile(content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved})
 
-    with workers.holding(caller, size):
-        async with workers.admit(replace(caller, long=True)) as call:
-            return await workers.run(make, call)
+    with caller.holding(size):
+        async with replace(caller, long=True).admit() as call:
+            return await call.run(make)
 
 
 async def nric_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: Sequence[Sequence[float]],
@@ -263,7 +253,7 @@ async def nric_file(
     Raises LatentError, and TooManyCodesError if they exceed the limit of one answer.
     """
     codes, _ = model.latents.codes(latents, bounds)
-    async with batch(workers, caller, nric_size(model, len(codes), factors=factors)) as work:
+    async with batch(caller, nric_size(model, len(codes), factors=factors)) as work:
         began = time.perf_counter()
         found, parts = await predictions(work, model, codes, factors=factors)
         seconds = {"network": time.perf_counter() - began}

@@ -19,7 +19,7 @@ from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.limits.workers import Call, Caller, in_parallel
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
 from shapespace.service.use_cases.batch import EncodedFile, batch, solve_all
@@ -27,7 +27,6 @@ from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.one_shape import ColourOptions
 from shapespace.service.use_cases.sequence_formats import Frames, encode_frames, json_line
 from shapespace.service.use_cases.shape_formats import summarise, with_topology
-from shapespace.solve.deadline import Deadline
 
 
 class TooManyFramesError(ValueError):
@@ -80,7 +79,6 @@ def frame_memory(model: ShapeModel, animation: Animation, k: int) -> Examples:
 
 
 async def sequence_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     animation: Animation,
@@ -100,7 +98,7 @@ async def sequence_file(
         memory = memory.followed_by(code) if isinstance(memory, Fade) else memory
     # Colours take as much memory as positions.
     caller = replace(caller, long=True)
-    async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
+    async with batch(caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         # A frame has the same bytes alone and in the whole animation.
         found = await shapes(work, model, codes, inside, mesh, quality, apart=True, examples=memory)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
@@ -122,17 +120,17 @@ async def sequence_file(
 
 
 async def sequence_lines(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
+    caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
 ) -> AsyncGenerator[bytes, None]:
-    """Yield each frame as a line of JSON as soon as it is ready; raises BusyError and as ``Workers.run``."""
+    """Yield each frame as a line of JSON as soon as it is ready; raises BusyError and as ``Call.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
     faces, memory = model.mesh(animation.mesh).faces, animation.memory(model.latents)
 
-    def lines(some: slice, deadline: Deadline) -> tuple[list[bytes], Exception | None]:
+    def lines(some: slice, call: Call) -> tuple[list[bytes], Exception | None]:
         """Return the lines of some frames; with an error only the lines before it."""
         found: list[bytes] = []
         own = memory[some] if isinstance(memory, Fade) else memory
-        solved = solve_all(workers, model, animation.mesh, quality, (codes[some], inside[some]), deadline, own)
+        solved = solve_all(call, model, animation.mesh, quality, (codes[some], inside[some]), own)
         times = animation.positions[some].tolist()
         try:
             for k, t, shape in zip(count(some.start), times, solved, strict=False):
@@ -143,17 +141,17 @@ async def sequence_lines(
 
     # Each run of frames has its own deadline, because a stream may take as long as its reader takes.
     caller = replace(caller, long=True)
-    with workers.stream(caller):
+    with caller.stream():
         # The first frame is computed alone, so that nobody waits for the others.
         first = slice(0, 1)
         runs = model.decoder.frames(codes, quality, memory)
         rest = (slice(max(run.start, 1), run.stop) for run in runs if run.stop > 1)
-        ready, error = await workers.piece(partial(lines, first), caller)
+        ready, error = await caller.run(partial(lines, first))
         for line in ready:
             yield line
         if error:
             raise error
-        async with aclosing(workers.map(lines, rest, caller)) as batches:
+        async with aclosing(in_parallel(caller, lines, rest)) as batches:
             async for ready, error in batches:
                 for line in ready:
                     yield line

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Request, Response
 from shapespace import __version__
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.dependencies import CallerDependency, Model, Service, ServiceDependency
+from shapespace.service.http.dependencies import AskedDependency, Model, Service, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.binary_tensors import HEADER, read_codes, read_request, write_answer
 from shapespace.service.http.messages.bodies import read
@@ -33,7 +33,7 @@ from shapespace.service.http.messages.open_inference import (
     model_metadata,
     model_statistics,
 )
-from shapespace.service.http.responses import diagnostics_header, encoded_response
+from shapespace.service.http.responses import encoded_response, file_headers
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import infer as infer_file
 from shapespace.service.use_cases.many_shapes import most_inferred
@@ -137,16 +137,16 @@ async def model_ready(model: Model) -> ModelReadiness:
 
 @router.post(f"{_VERSION}/infer", name="infer_version", **_INFER)
 @router.post(f"{_DEFAULT}/infer", name="infer", **_INFER)
-async def infer(service: ServiceDependency, request: Request, caller: CallerDependency, model: Model) -> Response:
+async def infer(asked: AskedDependency, model: Model) -> Response:
     """Lengths and angles, vertices, or both, for latent codes."""
+    service, request = asked.service, asked.request
     message, tail = await asyncio.to_thread(read_request, await request.body(), request.headers.get(HEADER))
     require_count(message.inputs[0].shape[0], service.settings.max_codes, "inputs[0].shape")
     options, write = message.parameters, partial(write_answer, message, model)
     tally, began = service.inferences[model.manifest.name, model.manifest.version], time.perf_counter()
     try:
         written = await infer_file(
-            service.workers,
-            caller,
+            asked.caller,
             model,
             read_codes(message, tail),
             options.bounds,
@@ -159,10 +159,9 @@ async def infer(service: ServiceDependency, request: Request, caller: CallerDepe
         tally.add("fail", time.perf_counter() - began)
         raise
     tally.succeed(message.inputs[0].shape[0], time.perf_counter() - began, written.seconds)
-    headers = diagnostics_header(written.diagnostics) if written.diagnostics else {}
-    if HEADER not in written.facts:
-        return encoded_response(service, written, headers, "application/json")
-    return encoded_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)
+    media_type = OCTET_STREAM if HEADER in written.facts else "application/json"
+    headers = file_headers(written) | {name: str(value) for name, value in written.facts.items()}
+    return encoded_response(service, written, media_type, headers)
 
 
 def _limits(service: Service, model: ShapeModel) -> ModelLimits:

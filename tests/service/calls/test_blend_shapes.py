@@ -99,7 +99,7 @@ def test_more_than_an_answer_holds_is_refused_before_it_is_made(
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", 41 * 1000 - 1)
     workers = Workers(1, 0, deadline=60)
     with pytest.raises(TooManyCodesError, match="41 shapes of 1000 vertices are too many"):
-        asyncio.run(blend_shapes_file(workers, Caller("somebody", asyncio.Event().wait), model, MeshChoice.COARSE))
+        asyncio.run(blend_shapes_file(Caller(workers, "somebody", asyncio.Event().wait), model, MeshChoice.COARSE))
     workers.close()
 
 

@@ -86,9 +86,10 @@ def test_a_deadline_holds_between_codes_before_any_reconstruction_too(small_mode
     model = ShapeModel(read_bundle(small_models / "small" / "10"), 1)
 
     async def ask() -> None:
-        workers, caller = Workers(1, 0, deadline=0.1), Caller("", asyncio.Event().wait)
+        workers = Workers(1, 0, deadline=0.1)
+        caller = Caller(workers, "", asyncio.Event().wait)
         try:
-            await nric_file(workers, caller, model, [CODE["latent"]] * 5000, Bounds.ALLOW, factors=False)
+            await nric_file(caller, model, [CODE["latent"]] * 5000, Bounds.ALLOW, factors=False)
         finally:
             workers.close()
 
