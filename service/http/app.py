@@ -111,7 +111,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(Compress),
-        Middleware(RequireHost, hosts=_hosts(settings)),
+        *([Middleware(RequireHost, hosts=hosts)] if (hosts := _hosts(settings)) else []),
         *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -16,6 +16,7 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
+from shapespace.service.http.messages.open_inference import ModelStatistics
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
@@ -23,7 +24,6 @@ from shapespace.service.limits.sandbox import Sandbox
 from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
-from shapespace.service.operation.statistics import InferenceTally
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
 
@@ -41,9 +41,7 @@ class Service:
     answers: AnswerCache
     sandbox: Sandbox
     #: Inferences by name and version of the model.
-    inferences: defaultdict[tuple[str, str], InferenceTally] = field(
-        default_factory=lambda: defaultdict(InferenceTally)
-    )
+    inferences: dict[tuple[str, str], ModelStatistics] = field(default_factory=dict)
     #: Whether the server is shutting down, so that clients should use another one.
     draining: bool = False
 

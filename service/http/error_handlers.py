@@ -33,39 +33,33 @@ from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFra
 from shapespace.service.use_cases.shape_formats import NoRoomError
 from shapespace.service.use_cases.uploads import UnknownFormatError, UnusableMeshError
 
-#: Kind of problem of each exception of the model and the use cases; the message becomes the detail.
-_KINDS: dict[type[Exception], str] = {
-    UnknownModelError: "unknown-model",
-    UnknownVersionError: "unknown-version",
-    UnknownInterpolationError: "unknown-interpolation",
-    UnknownFrameError: "unknown-frame",
-    WrongLengthError: "wrong-length",
-    NotFiniteError: "not-finite",
-    OutOfBoundsError: "out-of-bounds",
-    InvalidFixedError: "invalid-request",
-    InvalidCovarianceError: "invalid-request",
-    NoCodesError: "invalid-request",
-    TooManyCodesError: "too-many-codes",
-    TooManyFramesError: "too-many-frames",
-    PathTooLongError: "path-too-long",
-    InvalidTargetError: "invalid-request",
-    UnreadableFormError: "malformed-request",
-    FormFieldError: "invalid-request",
-    UnknownFormatError: "unsupported-media-type",
-    UnusableMeshError: "invalid-mesh",
-    InvalidMeshError: "invalid-mesh",
-    InvalidScanError: "invalid-scan",
-    NoTangentSpaceError: "no-tangent-space",
-    PeriodicError: "periodic",
-    BusyError: "busy",
-    DeadlineError: "deadline-passed",
-    NoRoomError: "no-room",
-    ModelFailedError: "model-failed",
-    NetworkTimeError: "model-failed",
-    DisconnectedError: "client-closed",
-    ClientDisconnect: "client-closed",
-    EndingError: "not-ready",
+#: Exceptions of the model and the use cases by kind of problem; the message becomes the detail.
+_EXCEPTIONS: dict[str, tuple[type[Exception], ...]] = {
+    "unknown-model": (UnknownModelError,),
+    "unknown-version": (UnknownVersionError,),
+    "unknown-interpolation": (UnknownInterpolationError,),
+    "unknown-frame": (UnknownFrameError,),
+    "wrong-length": (WrongLengthError,),
+    "not-finite": (NotFiniteError,),
+    "out-of-bounds": (OutOfBoundsError,),
+    "invalid-request": (InvalidFixedError, InvalidCovarianceError, NoCodesError, InvalidTargetError, FormFieldError),
+    "too-many-codes": (TooManyCodesError,),
+    "too-many-frames": (TooManyFramesError,),
+    "path-too-long": (PathTooLongError,),
+    "malformed-request": (UnreadableFormError,),
+    "unsupported-media-type": (UnknownFormatError,),
+    "invalid-mesh": (UnusableMeshError, InvalidMeshError),
+    "invalid-scan": (InvalidScanError,),
+    "no-tangent-space": (NoTangentSpaceError,),
+    "periodic": (PeriodicError,),
+    "busy": (BusyError,),
+    "deadline-passed": (DeadlineError,),
+    "no-room": (NoRoomError,),
+    "model-failed": (ModelFailedError, NetworkTimeError),
+    "client-closed": (DisconnectedError, ClientDisconnect),
+    "not-ready": (EndingError,),
 }
+_KINDS = {exception: kind for kind, exceptions in _EXCEPTIONS.items() for exception in exceptions}
 DOMAIN_ERRORS = tuple(_KINDS)
 
 

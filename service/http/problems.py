@@ -26,7 +26,6 @@ KINDS = {
     "malformed-request": ProblemKind(400, "The request can't be read"),
     "unauthorized": ProblemKind(401, "No valid API key"),
     "cross-origin": ProblemKind(400, "Not allowed to this page"),
-    "no-host": ProblemKind(400, "No Host, or several"),
     "not-found": ProblemKind(404, "Nothing is here"),
     "unknown-model": ProblemKind(404, "Unknown model"),
     "unknown-version": ProblemKind(404, "Unknown version of the model"),

@@ -1,4 +1,4 @@
-"""Bodies of requests.
+"""Bodies of requests, and JSON in queries and forms.
 
 JSON is counted before it is parsed, and a few faults suffice to refuse it. Large bodies are checked in a thread. Files
 are gathered in pieces.
@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 import orjson
 from fastapi import Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
 from shapespace.service.http.problems import ProblemError
@@ -23,6 +23,7 @@ from shapespace.service.use_cases.json_names import repeated_member
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
 #: Maximum number of values in a body, counted by separators; after parsing they take at most 20 MB.
 MOST_VALUES = 2**18
 #: Bodies up to this size in bytes are parsed on the event loop, which is faster than in a thread.
@@ -103,6 +104,17 @@ def _parse(text: bytes) -> object:
     except ValueError:
         where, why = 0, "a number of thousands of digits"
     raise RequestValidationError([{"type": "json_invalid", "loc": ("body", where), "ctx": {"error": why}}])
+
+
+def read_query(text: str, name: str, model: TypeAdapter[T]) -> T:
+    """Return the value of a parameter; raises RequestValidationError, or ProblemError if the text is not JSON."""
+    try:
+        return model.validate_python(parse(text.encode()))
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+        raise RequestValidationError([{**fault, "loc": ("query", name, *fault["loc"])} for fault in faults]) from None
+    except RequestValidationError:
+        raise ProblemError("invalid-request", f"{name} is not JSON. Send one valid JSON value.") from None
 
 
 async def gather(request: Request) -> deque[memoryview]:

@@ -20,7 +20,7 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.dependencies import Format, one_of
-from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.messages.bodies import read_query
 from shapespace.service.http.negotiation import choose, listed
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Body, Number

@@ -14,7 +14,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 
 from shapespace.model.options import descriptions
-from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.messages.bodies import read_query
 from shapespace.service.http.problems import ProblemError
 from shapespace.service.use_cases.fields import Number, NumbersByIndex, NumberText, Whole, WholeText
 from shapespace.service.use_cases.forms import OPTIONS

@@ -27,11 +27,11 @@ from shapespace.service.http.messages.open_inference import (
     ModelLimits,
     ModelMetadata,
     ModelReadiness,
+    ModelStatistics,
     ServerMetadata,
     StatisticsAnswer,
     model_configuration,
     model_metadata,
-    model_statistics,
 )
 from shapespace.service.http.responses import encoded_response, file_headers
 from shapespace.service.use_cases.batch import require_count
@@ -102,7 +102,7 @@ async def repository_index(service: ServiceDependency, request: Request) -> list
 @router.get("/models/stats", responses=problems(404, 422), name="all_statistics")
 async def all_statistics(service: ServiceDependency) -> StatisticsAnswer:
     """Numbers and times of the inferences of every version of every model."""
-    return _statistics(service, service.repository.all())
+    return _all_statistics(service, service.repository.all())
 
 
 @router.get(f"{_VERSION}/stats", responses=problems(404, 422), name="version_statistics")
@@ -111,7 +111,7 @@ async def statistics(service: ServiceDependency, request: Request, model: Model)
     """Numbers and times of the inferences of a model, for each version unless one is named."""
     named = "version" in request.path_params or "version" in request.query_params
     every = (each for each in service.repository.all() if each.manifest.name == model.manifest.name)
-    return _statistics(service, [model] if named else every)
+    return _all_statistics(service, [model] if named else every)
 
 
 @router.get(f"{_VERSION}/config", responses=problems(404, 422), name="version_configuration")
@@ -143,7 +143,7 @@ async def infer(asked: AskedDependency, model: Model) -> Response:
     message, tail = await asyncio.to_thread(read_request, await request.body(), request.headers.get(HEADER))
     require_count(message.inputs[0].shape[0], service.settings.max_codes, "inputs[0].shape")
     options, write = message.parameters, partial(write_answer, message, model)
-    tally, began = service.inferences[model.manifest.name, model.manifest.version], time.perf_counter()
+    tally, began = _statistics(service, model), time.perf_counter()
     try:
         written = await infer_file(
             asked.caller,
@@ -156,7 +156,7 @@ async def infer(asked: AskedDependency, model: Model) -> Response:
             write,
         )
     except Exception:
-        tally.add("fail", time.perf_counter() - began)
+        tally.inference_stats.fail.add(time.perf_counter() - began)
         raise
     tally.succeed(message.inputs[0].shape[0], time.perf_counter() - began, written.seconds)
     media_type = OCTET_STREAM if HEADER in written.facts else "application/json"
@@ -170,11 +170,10 @@ def _limits(service: Service, model: ShapeModel) -> ModelLimits:
     return ModelLimits(max_codes=codes, max_body=settings.max_body, deadline=settings.deadline)
 
 
-def _statistics(service: Service, models: Iterable[ShapeModel]) -> StatisticsAnswer:
-    found = {(model.manifest.name, int(model.manifest.version)): model for model in models}
-    return StatisticsAnswer(
-        model_stats=[
-            model_statistics(model, service.inferences[name, str(version)])
-            for (name, version), model in sorted(found.items(), key=lambda item: item[0])
-        ]
-    )
+def _statistics(service: Service, model: ShapeModel) -> ModelStatistics:
+    return service.inferences.setdefault((model.manifest.name, model.manifest.version), ModelStatistics.of(model))
+
+
+def _all_statistics(service: Service, models: Iterable[ShapeModel]) -> StatisticsAnswer:
+    ordered = sorted(models, key=lambda model: (model.manifest.name, int(model.manifest.version)))
+    return StatisticsAnswer(model_stats=[_statistics(service, model) for model in ordered])

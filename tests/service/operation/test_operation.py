@@ -160,11 +160,6 @@ def test_the_processors_of_a_container_are_those_of_its_quota(tmp_path: Path) ->
     for quota, expected in (("max", everything), ("100000", 1), ("20000", 1), ("99900000", everything)):
         (tmp_path / "cpu.max").write_text(f"{quota} 100000\n")
         assert cpu_quota(tmp_path) == expected
-    old = tmp_path / "old" / "cpu"
-    old.mkdir(parents=True)
-    (old / "cpu.cfs_quota_us").write_text("100000\n")
-    (old / "cpu.cfs_period_us").write_text("100000\n")
-    assert cpu_quota(tmp_path / "old") == 1
 
 
 @pytest.mark.long
