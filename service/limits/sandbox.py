@@ -1,10 +1,8 @@
 """Child processes for untrusted data, with limits of memory and time.
 
-This is the only defence against hostile uploads and bundles. The readers of files have no limits of their own except
-on the size of the mesh, which they need for their messages. Limits in the readers were the alternative. The process is
-better for three reasons. ONNX Runtime, which runs the networks of a bundle, has no such limits, so that the process is
-needed in any case. Only a process also stops a reader that is slow, hangs or crashes. And a limit of the kernel holds
-for every line of every reader, while a reader has to count at each of its allocations.
+This is the only defence against hostile uploads and bundles: the readers of files limit nothing but the size of the
+mesh. A limit of the kernel holds for every line of every reader and of ONNX Runtime, and only a process can be stopped
+that is slow, hangs or crashes.
 
 A child is a fresh interpreter, not a fork of the server. It imports one function, and the server sends arguments as
 JSON and a body as bytes. The child answers with JSON and arrays, at most as many bytes as the caller allows. If a file

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
@@ -177,18 +177,14 @@ class ModelRepository:
 
     def signature(self) -> Signature:
         """Return the state of the folder and of the file, which changes with any bundle, without reading bundles."""
-        found = []
-        if self._file:
-            with suppress(OSError):
-                status = self._file.stat()
-                found.append((str(self._file), status.st_size, status.st_mtime_ns, status.st_ino))
+        folders: list[Path] = []
         with suppress(OSError):  # the folder is changing; the next check compares again
-            for version in bundle_folders(self._folder)[0]:
-                found.append((str(version), 0, 0, 0))
-                with suppress(OSError), os.scandir(version) as entries:
-                    for entry in entries:
-                        status = entry.stat(follow_symlinks=False)
-                        found.append((entry.path, status.st_size, status.st_mtime_ns, status.st_ino))
+            folders = bundle_folders(self._folder)[0]
+        found = []
+        for path in chain([self._file] if self._file else [], folders, *(folder.glob("*") for folder in folders)):
+            with suppress(OSError):
+                status = path.stat(follow_symlinks=path == self._file)
+                found.append((str(path), status.st_size, status.st_mtime_ns, status.st_ino))
         return tuple(sorted(found))
 
     def __iter__(self) -> Iterator[ShapeModel]:

@@ -87,7 +87,6 @@ async def encode(
         LatentError: numbers overflow, the code lies outside the bounds where that is refused, or a fixed coordinate
             does not exist.
         TooManyCodesError: more than ``most`` samples.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
 
     def checked(fields: Mapping[str, str]) -> tuple[ShapeModel, EncodeOptions]:
@@ -158,7 +157,6 @@ async def edit(
         InvalidTargetError: no such vertex, or too many targets.
         LatentError: a start that can't be used, or no such coordinate.
         TooManyCodesError: more than ``most`` samples.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
     # Refused before the call waits for a worker.
     require_targets(model.decoder, targets, options.mesh)
@@ -199,7 +197,6 @@ async def fit(
 
     Raises:
         UploadError, InvalidScanError: the scan can't be used.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
 
     def make(call: Call) -> Answered:

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 
 from shapespace.files.limits import as_utf8, label
 
@@ -99,7 +99,6 @@ class _Parser:
     def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
         self.parts: list[FormPart] = []
         self._body, self._start, self._stop, self._short = memoryview(body), 0, 0, 0
-        self._ended = False
         self._headers: dict[bytes, bytes] = {}
         self._header = b""
         if boundary is None:
@@ -116,18 +115,14 @@ class _Parser:
                     "on_headers_finished": self._on_headers_finished,
                     "on_part_data": self._on_part_data,
                     "on_part_end": self._on_part_end,
-                    "on_end": self._on_end,
                 },
             )
             # In one call, so that positions are positions in the body.
             parser.write(body)  # type: ignore[arg-type]
         except FormParserError:
             raise _unreadable("Invalid multipart data.") from None
-        if not self._ended:
+        if parser.state != MultipartState.END:
             raise _unreadable("It ends before its last boundary.", "Send all of it.")
-
-    def _on_end(self) -> None:
-        self._ended = True
 
     def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
         self._header = bytes(data[start : min(stop, start + LONGEST_HEADER)]).lower()
@@ -143,10 +138,8 @@ class _Parser:
             raise _unreadable(f"Too many fields. Maximum number of fields is {_MOST_FIELDS}.")
         media_type, _ = parse_options_header(self._headers.get(b"content-type"))
         file = options.get(b"filename")
-        name, file_name = (
-            options[b"name"].decode(errors="replace"),
-            None if file is None else file.decode(errors="replace"),
-        )
+        name = options[b"name"].decode(errors="replace")
+        file_name = None if file is None else file.decode(errors="replace")
         self.parts.append(FormPart(name, file_name, media_type.decode("latin-1"), self._body[:0]))
         self._start, self._stop = 0, 0
 

@@ -7,11 +7,11 @@ import hashlib
 import hmac
 import re
 import time
-from collections import OrderedDict
 from collections.abc import Collection
 from http import HTTPStatus
 from urllib.parse import unquote
 
+from cachetools import LRUCache
 from pydantic import SecretStr
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
@@ -92,7 +92,7 @@ class RequireKey(HTTPMiddleware):
         super().__init__(app)
         self._digest = _digest(key.get_secret_value())
         #: Time at which the next wrong key from an address may be answered.
-        self._next: OrderedDict[str, float] = OrderedDict()
+        self._next: LRUCache[str, float] = LRUCache(KEY_ADDRESSES)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on requests that have the key or need none."""
@@ -104,15 +104,12 @@ class RequireKey(HTTPMiddleware):
         kind, detail = "unauthorized", "Send the server's API key: Authorization: Bearer KEY, or X-API-Key: KEY."
         if given:
             now, client = time.monotonic(), client_of(scope)
-            turn = max(now, self._next.pop(client, 0.0))
+            turn = max(now, self._next.get(client, 0.0))
             if turn - now > KEY_WAIT:
                 kind, detail = "busy", "Too many wrong keys came from this address. Send the right key."
-                self._next[client] = turn
             else:
                 self._next[client] = turn + KEY_INTERVAL
                 await asyncio.sleep(turn - now)
-            if len(self._next) > KEY_ADDRESSES:
-                self._next.popitem(last=False)
         await problem(scope, kind, detail)(scope, receive, send)
 
 
