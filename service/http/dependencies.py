@@ -21,9 +21,10 @@ from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
-from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
+from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
 
@@ -71,7 +72,7 @@ async def _asked(request: Request) -> Asked:
                 pass
         except HTTPException as error:  # the rest of the body is over the limit
             return error
-        return DisconnectedError("The client closed the connection before its answer was ready.")
+        return RefusedError("client-closed", "The client closed the connection before its answer was ready.")
 
     service = await _service(request)
     client = client_name(request.client.host) if request.client else ""

@@ -24,48 +24,30 @@ from shapespace.model.scan import InvalidScanError
 from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from shapespace.refused_values import WANTED
 from shapespace.service.http.problems import ProblemError, problem, shortened
-from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
-from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
-from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
-from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
-from shapespace.service.use_cases.forms import FormFieldError, UnreadableFormError
-from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
-from shapespace.service.use_cases.shape_formats import NoRoomError
-from shapespace.service.use_cases.uploads import UnknownFormatError, UnusableMeshError
+from shapespace.service.refusals import RefusedError
 
-#: Exceptions of the model and the use cases by kind of problem; the message becomes the detail.
-_EXCEPTIONS: dict[str, tuple[type[Exception], ...]] = {
-    "unknown-model": (UnknownModelError,),
-    "unknown-version": (UnknownVersionError,),
-    "unknown-interpolation": (UnknownInterpolationError,),
-    "unknown-frame": (UnknownFrameError,),
-    "wrong-length": (WrongLengthError,),
-    "not-finite": (NotFiniteError,),
-    "out-of-bounds": (OutOfBoundsError,),
-    "invalid-request": (InvalidFixedError, InvalidCovarianceError, NoCodesError, InvalidTargetError, FormFieldError),
-    "too-many-codes": (TooManyCodesError,),
-    "too-many-frames": (TooManyFramesError,),
-    "path-too-long": (PathTooLongError,),
-    "malformed-request": (UnreadableFormError,),
-    "unsupported-media-type": (UnknownFormatError,),
-    "invalid-mesh": (UnusableMeshError, InvalidMeshError),
-    "invalid-scan": (InvalidScanError,),
-    "no-tangent-space": (NoTangentSpaceError,),
-    "periodic": (PeriodicError,),
-    "busy": (BusyError,),
-    "deadline-passed": (DeadlineError,),
-    "no-room": (NoRoomError,),
-    "model-failed": (ModelFailedError, NetworkTimeError),
-    "client-closed": (DisconnectedError, ClientDisconnect),
-    "not-ready": (EndingError,),
+#: Kind of problem of each exception of the model and of the framework; the message becomes the detail.
+_KINDS: dict[type[Exception], str] = {
+    WrongLengthError: "wrong-length",
+    NotFiniteError: "not-finite",
+    OutOfBoundsError: "out-of-bounds",
+    InvalidFixedError: "invalid-request",
+    InvalidCovarianceError: "invalid-request",
+    InvalidTargetError: "invalid-request",
+    InvalidMeshError: "invalid-mesh",
+    InvalidScanError: "invalid-scan",
+    NoTangentSpaceError: "no-tangent-space",
+    PeriodicError: "periodic",
+    ModelFailedError: "model-failed",
+    NetworkTimeError: "model-failed",
+    ClientDisconnect: "client-closed",
 }
-_KINDS = {exception: kind for kind, exceptions in _EXCEPTIONS.items() for exception in exceptions}
-DOMAIN_ERRORS = tuple(_KINDS)
+DOMAIN_ERRORS = (RefusedError, *_KINDS)
 
 
 def install(app: FastAPI) -> None:
     """Let an application answer every error as a problem."""
-    for exception in _KINDS:
+    for exception in DOMAIN_ERRORS:
         app.add_exception_handler(exception, domain_problem)
     app.add_exception_handler(StarletteHTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
@@ -73,7 +55,8 @@ def install(app: FastAPI) -> None:
 
 async def domain_problem(request: Request, error: Exception) -> Response:
     """Return one of the DOMAIN_ERRORS as a problem."""
-    return problem(request.scope, _KINDS[type(error)], str(error))
+    kind = error.kind if isinstance(error, RefusedError) else _KINDS[type(error)]
+    return problem(request.scope, kind, str(error))
 
 
 async def resumed(

@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from shapespace.service.limits.quota import Quota, QuotaError
 from shapespace.service.limits.turns import Turns
+from shapespace.service.refusals import RefusedError
 from shapespace.solve.deadline import Deadline
 
 S = TypeVar("S")
@@ -29,22 +30,6 @@ SEARCH_GRACE_SECONDS = 5.0
 MEMORY = 384 * 2**20
 #: What a client can do whose request was not answered by its deadline.
 ADVICE = "Ask for fewer shapes at once, stream the frames as JSON lines, or try again when the server is less busy."
-
-
-class BusyError(RuntimeError):
-    """The queue is full."""
-
-
-class DeadlineError(TimeoutError):
-    """The deadline of a request has passed."""
-
-
-class DisconnectedError(ConnectionError):
-    """The client has left."""
-
-
-class EndingError(RuntimeError):
-    """The server ends before the answer is ready."""
 
 
 class Workers:
@@ -102,9 +87,9 @@ class Caller:
 
     @asynccontextmanager
     async def admit(self, advice: str = ADVICE) -> AsyncIterator[Call]:
-        """Admit a request for the duration of the block, and yield it; raises BusyError.
+        """Admit a request for the duration of the block, and yield it; raises RefusedError, busy.
 
-        The DeadlineError of a late request ends with the advice.
+        The error of a late request ends with the advice.
         """
         with self._place(self.workers.places), self._call(advice) as call:
             watching = asyncio.create_task(self._watch(call))
@@ -115,13 +100,13 @@ class Caller:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """Admit a streamed answer for the duration of the block; raises BusyError."""
+        """Admit a streamed answer for the duration of the block; raises RefusedError, busy."""
         with self._place(self.workers.streams):
             yield
 
     @contextmanager
     def holding(self, size: int) -> Iterator[ExitStack]:
-        """Reserve bytes for an answer until the block ends or a new owner of the stack closes it; raises BusyError."""
+        """Reserve bytes until the block ends, or a new owner closes the stack; raises RefusedError, busy."""
         with ExitStack() as held:
             held.enter_context(self._place(self.workers.memory, size))
             yield held
@@ -137,8 +122,8 @@ class Caller:
             quota.take(self.client, amount)
         except QuotaError:
             whose = "" if quota.used + amount > quota.limit else " for this client"
-            raise BusyError(
-                f"All workers are busy and the queue is full{whose}. Try again after the time in Retry-After."
+            raise RefusedError(
+                "busy", f"All workers are busy and the queue is full{whose}. Try again after the time in Retry-After."
             ) from None
         try:
             yield
@@ -182,10 +167,12 @@ class Call(Deadline):
         if not self._over.done():
             self._over.set_exception(error)
 
-    def late(self, advice: str = "") -> DeadlineError:
+    def late(self, advice: str = "") -> RefusedError:
         """Return the error of this call if its deadline has passed."""
         seconds = self.caller.workers.deadline
-        return DeadlineError(f"The answer was not ready within {seconds:g} s. {advice or self._advice}")
+        return RefusedError(
+            "deadline-passed", f"The answer was not ready within {seconds:g} s. {advice or self._advice}"
+        )
 
     def close(self) -> None:
         """Stop the timer, because the work is done."""
@@ -253,5 +240,7 @@ async def in_parallel(
         await asyncio.gather(*running, return_exceptions=True)
 
 
-def _ending() -> EndingError:
-    return EndingError("The server is about to end. Send the request to another one, or again in a moment.")
+def _ending() -> RefusedError:
+    return RefusedError(
+        "not-ready", "The server is about to end. Send the request to another one, or again in a moment."
+    )

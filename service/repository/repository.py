@@ -23,6 +23,7 @@ from shapespace.service.limits.sandbox_messages import (
     in_a_line,
 )
 from shapespace.service.logs import printable
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.validation import BundleValidator, bundle_folders
 from shapespace.service.versions import DefaultVersions, DefaultVersionsError
 
@@ -30,14 +31,6 @@ logger = logging.getLogger(__name__)
 
 #: State of a folder of bundles: (path, size, time of change, inode) of each file.
 Signature = tuple[tuple[str, int, int, int], ...]
-
-
-class UnknownModelError(LookupError):
-    """No model has this name."""
-
-
-class UnknownVersionError(LookupError):
-    """The model has no such version."""
 
 
 Models = Mapping[str, Mapping[int, ShapeModel]]
@@ -200,7 +193,7 @@ class ModelRepository:
         return (model for versions in self._served[0].values() for model in versions.values())
 
     def versions(self, name: str) -> list[str]:
-        """Return the versions of a model, oldest first; raises UnknownModelError."""
+        """Return the versions of a model, oldest first; raises RefusedError, unknown-model."""
         return [str(version) for version in sorted(_named(name, self._served[0]))]
 
     def share(self, model: ShapeModel) -> float:
@@ -214,7 +207,7 @@ class ModelRepository:
         return defaults.divides(name, models.get(name, {}))
 
     def get(self, name: str, version: str | None = None, key: bytes | None = None) -> ShapeModel:
-        """Return a model; raises UnknownModelError or UnknownVersionError.
+        """Return a model; raises RefusedError, unknown-model or unknown-version.
 
         Args:
             name: name of the model.
@@ -229,8 +222,9 @@ class ModelRepository:
             if str(number) == version:
                 return model
         known = ", ".join(map(str, sorted(versions)))
-        raise UnknownVersionError(
-            f"{name} has no version {version!r}. Choose one of {known}, or none for the default version."
+        raise RefusedError(
+            "unknown-version",
+            f"{name} has no version {version!r}. Choose one of {known}, or none for the default version.",
         )
 
     def by_digest(self, prefix: str) -> ShapeModel | None:
@@ -241,7 +235,7 @@ class ModelRepository:
 def _named(name: str, models: Models) -> Mapping[int, ShapeModel]:
     if name not in models:
         known = ", ".join(sorted(models)) or "none at the moment"
-        raise UnknownModelError(f"There is no model {name!r}. /v1/models lists the models: {known}.")
+        raise RefusedError("unknown-model", f"There is no model {name!r}. /v1/models lists the models: {known}.")
     return models[name]
 
 

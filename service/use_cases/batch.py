@@ -19,6 +19,7 @@ from shapespace.model.memory import Examples
 from shapespace.model.shape import Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller, in_parallel
+from shapespace.service.refusals import RefusedError
 from shapespace.service.tracing import record_stages
 from shapespace.solve.blas_threads import OneBlasThread
 from shapespace.solve.outcome import Status
@@ -30,14 +31,6 @@ Timings = dict[str, float]
 WHOLE_FILE_BYTES = 2**22
 S = TypeVar("S")
 T = TypeVar("T")
-
-
-class NoCodesError(ValueError):
-    """A request asks for no code."""
-
-
-class TooManyCodesError(ValueError):
-    """A request asks for more codes than one answer may hold."""
 
 
 class PiecewiseFile:
@@ -113,7 +106,7 @@ class Batch:
 
 @asynccontextmanager
 async def batch(caller: Caller, size: int) -> AsyncIterator[Batch]:
-    """Admit a request for many codes, and reserve bytes for the arrays of its answer; raises BusyError."""
+    """Admit a request for many codes, and reserve bytes for the arrays of its answer; raises RefusedError, busy."""
     with caller.holding(size) as held:
         async with caller.admit() as call:
             yield Batch(call, size, held)
@@ -122,7 +115,7 @@ async def batch(caller: Caller, size: int) -> AsyncIterator[Batch]:
 def solve(
     call: Call, model: ShapeModel, mesh: MeshChoice, quality: Quality, code: CheckedCode, examples: Examples = True
 ) -> Shape:
-    """Return the shape of a code; raises DeadlineError."""
+    """Return the shape of a code; raises RefusedError, deadline-passed."""
     return next(solve_all(call, model, mesh, quality, (code[0][None], np.array([code[1]])), examples))
 
 
@@ -134,7 +127,7 @@ def solve_all(
     codes: tuple[Codes, NDArray[np.bool_]],
     examples: Examples = True,
 ) -> Iterator[Shape]:
-    """Yield the shapes of codes (n, m), with (n,) whether each is inside the bounds; raises DeadlineError."""
+    """Yield the shapes of codes (n, m), with (n,) whether each is inside the bounds; raises as ``solve``."""
     found = model.decoder.shapes(*codes, mesh, call, quality, examples)
     while True:
         with OneBlasThread():
@@ -154,8 +147,10 @@ def total_seconds(seconds: Iterable[Timings]) -> Timings:
 
 
 def require_count(count: int, most: int, field: str = "latents") -> None:
-    """Raise NoCodesError for a request for no code, TooManyCodesError for one over the limit."""
+    """Raise RefusedError for a request for no code, or for more than ``most``."""
     if count > most:
-        raise TooManyCodesError(f"{field} asks for {count} codes; the limit is {most}. Send several requests.")
+        raise RefusedError(
+            "too-many-codes", f"{field} asks for {count} codes; the limit is {most}. Send several requests."
+        )
     if count == 0:
-        raise NoCodesError(f"{field} asks for no code. Send at least one code.")
+        raise RefusedError("invalid-request", f"{field} asks for no code. Send at least one code.")

@@ -24,11 +24,12 @@ from shapespace.service.limits.sandbox_messages import (
     OutOfMemoryError,
     SandboxError,
 )
-from shapespace.service.limits.workers import BusyError, Call, Caller, DeadlineError, EndingError
+from shapespace.service.limits.workers import Call, Caller
+from shapespace.service.refusals import RefusedError
 from shapespace.service.tracing import record_stages
 from shapespace.service.use_cases.batch import EncodedFile, Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
-from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_ERRORS, UnusableMeshError, UploadedMesh
+from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_KINDS, UploadedMesh
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -83,10 +84,9 @@ async def encode(
     An archive may hold up to ``most`` meshes. The answer then has the code of each, with the name of its file.
 
     Raises:
-        UploadError, InvalidMeshError: the mesh can't be used.
+        RefusedError, InvalidMeshError: the mesh can't be used, or there are more than ``most`` samples.
         LatentError: numbers overflow, the code lies outside the bounds where that is refused, or a fixed coordinate
             does not exist.
-        TooManyCodesError: more than ``most`` samples.
     """
 
     def checked(fields: Mapping[str, str]) -> tuple[ShapeModel, EncodeOptions]:
@@ -156,7 +156,7 @@ async def edit(
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
         LatentError: a start that can't be used, or no such coordinate.
-        TooManyCodesError: more than ``most`` samples.
+        RefusedError, too-many-codes: more than ``most`` samples.
     """
     # Refused before the call waits for a worker.
     require_targets(model.decoder, targets, options.mesh)
@@ -196,7 +196,7 @@ async def fit(
     ``progress`` is called in the thread that computes.
 
     Raises:
-        UploadError, InvalidScanError: the scan can't be used.
+        RefusedError, InvalidScanError: the scan can't be used.
     """
 
     def make(call: Call) -> Answered:
@@ -276,10 +276,7 @@ def read_upload(
         most: largest number of meshes; only an archive has several.
 
     Raises:
-        UploadError: the mesh can't be used.
-        DeadlineError: the file was not read in time.
-        BusyError: no process is available.
-        EndingError: the server ends.
+        RefusedError: the mesh can't be used, it was not read in time, no process is available, or the server ends.
     """
     facts: dict[str, Any] = {
         "content_type": upload.content_type,
@@ -293,21 +290,21 @@ def read_upload(
     try:
         said, arrays = sandbox.call(facts, upload.pieces, deadline=deadline, memory=memory, most=size)
     except FailedError as error:
-        if error.kind in UPLOAD_ERRORS:
-            raise UPLOAD_ERRORS[error.kind](error.sentence) from None
+        if error.kind in UPLOAD_KINDS:
+            raise RefusedError(error.kind, error.sentence) from None
         logger.error("the reader of an uploaded file crashed: %s", error.sentence)
         raise _unusable("it breaks its reader") from None
     except LateError:
-        raise DeadlineError("The file was not read in time. Send a smaller one.") from None
+        raise RefusedError("deadline-passed", "The file was not read in time. Send a smaller one.") from None
     except NoProcessError as error:
         logger.error("uploads can't be read: %s", error)
-        raise BusyError(
-            "The server can't start a process to read the file. Try again after the time in Retry-After."
+        raise RefusedError(
+            "busy", "The server can't start a process to read the file. Try again after the time in Retry-After."
         ) from None
     except OutOfMemoryError:
         raise _unusable("reading it takes more memory than a mesh of this model needs") from None
     except ClosedError as error:
-        raise EndingError("The server is about to end. Send the file to another one.") from error
+        raise RefusedError("not-ready", "The server is about to end. Send the file to another one.") from error
     except SandboxError as error:
         logger.warning("the process that reads an uploaded file ended: %s", error)
         raise _unusable("it breaks its reader") from None
@@ -316,5 +313,5 @@ def read_upload(
     return meshes, said["fields"]
 
 
-def _unusable(why: str) -> UnusableMeshError:
-    return UnusableMeshError(f"The mesh can't be used: {why}. Send a plain file of one mesh.")
+def _unusable(why: str) -> RefusedError:
+    return RefusedError("invalid-mesh", f"The mesh can't be used: {why}. Send a plain file of one mesh.")

@@ -9,6 +9,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 
 from shapespace.files.limits import as_utf8, label
+from shapespace.service.refusals import RefusedError
 
 #: Name of the field that holds options as JSON.
 OPTIONS = "options"
@@ -16,18 +17,6 @@ OPTIONS = "options"
 LONGEST_HEADER = 1000
 #: Most fields of a form beside the file, and most bytes of them together.
 _MOST_FIELDS, _LONGEST_FIELDS = 16, 2**18
-
-
-class UploadError(ValueError):
-    """An upload that can't be used. The message says what is wrong and what to do."""
-
-
-class UnreadableFormError(UploadError):
-    """The form breaks the rules of its format, or holds more than one file."""
-
-
-class FormFieldError(UploadError):
-    """The form has a field that the call doesn't have, or a field twice."""
 
 
 @dataclass
@@ -60,7 +49,7 @@ def read_form(
         known: names of the fields that the call has, beside ``options``; None accepts all.
 
     Raises:
-        UploadError: the form can't be read, or holds several files, or a field that the call doesn't have.
+        RefusedError: the form can't be read, or holds several files, or a field that the call doesn't have.
     """
     parts = _Parser(body, boundary).parts
     files = [part for part in parts if part.file_name is not None and part.name != OPTIONS]
@@ -75,9 +64,11 @@ def read_form(
             continue
         if known is not None and part.name not in (*known, OPTIONS):
             there = ", ".join((*known, OPTIONS))
-            raise FormFieldError(f"There is no field {label(part.name) or ''!r} here: choose among {there}.")
+            raise RefusedError(
+                "invalid-request", f"There is no field {label(part.name) or ''!r} here: choose among {there}."
+            )
         if part.name in fields:
-            raise FormFieldError(f"The form has the field {part.name!r} twice. Send it once.")
+            raise RefusedError("invalid-request", f"The form has the field {part.name!r} twice. Send it once.")
         fields[part.name] = _text(part)
     return file, fields
 
@@ -86,11 +77,13 @@ def _text(part: FormPart) -> str:
     try:
         return str(as_utf8(part.data), "utf-8")
     except ValueError:
-        raise FormFieldError(f"The field {part.name!r} is not text in UTF-8. Send it in UTF-8.") from None
+        raise RefusedError(
+            "invalid-request", f"The field {part.name!r} is not text in UTF-8. Send it in UTF-8."
+        ) from None
 
 
-def _unreadable(why: str, remedy: str = "Send one file in it.") -> UnreadableFormError:
-    return UnreadableFormError(f"The form can't be read: {why} {remedy}")
+def _unreadable(why: str, remedy: str = "Send one file in it.") -> RefusedError:
+    return RefusedError("malformed-request", f"The form can't be read: {why} {remedy}")
 
 
 class _Parser:

@@ -23,11 +23,11 @@ from shapespace.model.memory import Examples
 from shapespace.model.shape import Diagnostics, Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.workers import Call, Caller
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.batch import (
     Batch,
     EncodedFile,
     Timings,
-    TooManyCodesError,
     batch,
     solve,
     solve_all,
@@ -84,7 +84,7 @@ async def vertices_file(
     Raises:
         NoTangentSpaceError: the model has no exponentials.
         LatentError: a code is invalid.
-        TooManyCodesError: the shapes exceed the limit of one answer.
+        RefusedError, too-many-codes: the shapes exceed the limit of one answer.
     """
     if exponentials:
         require_tangent_space(model.decoder)
@@ -137,8 +137,9 @@ async def infer(
         shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
     )
     if size > BYTES_PER_VERTEX * MOST_VERTICES:
-        raise TooManyCodesError(
-            f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes."
+        raise RefusedError(
+            "too-many-codes",
+            f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes.",
         )
     caller = replace(caller, long=len(codes) > SHORT_INFERENCE)
     async with batch(caller, size) as work:
@@ -162,12 +163,13 @@ def most_inferred(model: ShapeModel) -> int:
 
 
 def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
-    """Return the size of several shapes in bytes; raises TooManyCodesError above the limit of one answer."""
+    """Return the size of several shapes in bytes; raises RefusedError above the limit of one answer."""
     vertices = len(model.mesh(mesh).vertices)
     if count * vertices > MOST_VERTICES:
-        raise TooManyCodesError(
+        raise RefusedError(
+            "too-many-codes",
             f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
-            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one."
+            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one.",
         )
     return BYTES_PER_VERTEX * count * vertices
 
@@ -222,7 +224,7 @@ async def blend_shapes_file(caller: Caller, model: ShapeModel, mesh: MeshChoice)
 
     Raises:
         PeriodicError: a coordinate is periodic, so that it has no bounds.
-        TooManyCodesError: all targets together have more vertices than one answer may hold.
+        RefusedError, too-many-codes: all targets together have more vertices than one answer may hold.
         NotFiniteError, ModelFailedError: the model has no shape at a bound.
     """
     require_ends(model.decoder)
@@ -250,7 +252,7 @@ async def nric_file(
 ) -> EncodedFile:
     """Return lengths and angles as the networks predict them, as JSON, on request also those of each factor.
 
-    Raises LatentError, and TooManyCodesError if they exceed the limit of one answer.
+    Raises LatentError, and RefusedError if they exceed the limit of one answer.
     """
     codes, _ = model.latents.codes(latents, bounds)
     async with batch(caller, nric_size(model, len(codes), factors=factors)) as work:
@@ -269,11 +271,11 @@ async def nric_file(
 
 
 def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
-    """Return the size of predictions in bytes; raises TooManyCodesError above the limit of one answer."""
+    """Return the size of predictions in bytes; raises RefusedError above the limit of one answer."""
     size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
     if count * size > MOST_NRIC_BYTES:
-        raise TooManyCodesError(
-            f"{count} codes are too many for one answer. Ask for {MOST_NRIC_BYTES // size} at most."
+        raise RefusedError(
+            "too-many-codes", f"{count} codes are too many for one answer. Ask for {MOST_NRIC_BYTES // size} at most."
         )
     return count * size
 

@@ -19,7 +19,8 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.__main__ import _serve
 from shapespace.service.http.app import create_app
 from shapespace.service.http.connections import IDLE_SECONDS
-from shapespace.service.limits.workers import Caller, DeadlineError, Workers
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, cpu_quota
 from shapespace.service.use_cases.many_shapes import nric_file
@@ -93,7 +94,7 @@ def test_a_deadline_holds_between_codes_before_any_reconstruction_too(small_mode
         finally:
             workers.close()
 
-    with pytest.raises(DeadlineError):
+    with pytest.raises(RefusedError):
         asyncio.run(ask())
 
 

@@ -15,9 +15,10 @@ from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import BusyError, Caller, Workers
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases import batch, many_shapes
-from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, TooManyCodesError
+from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.one_shape import ShapeRequest, shape_file
 from tests.service.bundles import write_bundle
@@ -84,7 +85,7 @@ def test_more_than_an_answer_may_hold_is_refused_before_any_work(
 ) -> None:
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
     ask = (model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
-    with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
+    with pytest.raises(RefusedError, match="Ask for 1 at most"):
         run(lambda workers: vertices_file(caller(workers), *ask))
     with pytest.raises(NoTangentSpaceError):
         run(lambda workers: vertices_file(caller(workers), *ask, exponentials=True))
@@ -104,10 +105,10 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
         )
 
     assert content(ask(["vertices"])) == b"x"
-    with pytest.raises(TooManyCodesError, match="too many for both outputs"):
+    with pytest.raises(RefusedError, match="too many for both outputs"):
         ask(["nric", "vertices"])
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
-    with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
+    with pytest.raises(RefusedError, match="Ask for 1 at most"):
         ask(["vertices"])
 
 
@@ -159,7 +160,7 @@ def test_one_caller_leaves_places_for_others(model: ShapeModel) -> None:
             for _ in range(share):
                 group.create_task(hold())
             await asyncio.sleep(0)
-            with pytest.raises(BusyError, match="for this client"):
+            with pytest.raises(RefusedError, match="for this client"):
                 await shape_file(caller(workers), model, ShapeRequest(None, MeshChoice.FINE, "json"))
             other = caller(workers, "somebody else")
             assert (await shape_file(other, model, ShapeRequest(None, MeshChoice.FINE, "json"))).content
