@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class RefusedError(Exception):
-    """A request that can't be answered, for a reason that the client learns.
+    """A request that can't be answered. The message says what to do.
 
     Attributes:
-        kind: kind of problem, a key of `shapespace.service.http.problems.KINDS`. The message says what to do.
+        kind: kind of problem, mostly a key of `shapespace.service.http.problems.KINDS`.
+        extensions: further members of the answer.
+        headers: further headers of the answer.
     """
 
-    def __init__(self, kind: str, detail: str) -> None:
+    def __init__(self, kind: str, detail: str, **extensions: Any) -> None:
         super().__init__(detail)
-        self.kind = kind
+        self.kind, self.extensions, self.headers = kind, extensions, dict[str, str]()

@@ -9,7 +9,6 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 from pydantic import Field, WithJsonSchema
-from starlette.exceptions import HTTPException
 
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape import Quality
@@ -17,7 +16,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
 from shapespace.service.http.messages.open_inference import ModelStatistics
-from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
@@ -70,7 +68,7 @@ async def _asked(request: Request) -> Asked:
         try:
             while (await request.receive())["type"] != "http.disconnect":
                 pass
-        except HTTPException as error:  # the rest of the body is over the limit
+        except RefusedError as error:  # the rest of the body is over the limit
             return error
         return RefusedError("client-closed", "The client closed the connection before its answer was ready.")
 
@@ -140,13 +138,13 @@ def query_names(request: Request) -> list[str] | None:
 
 
 async def known_query(request: Request) -> None:
-    """Raise ProblemError for query parameters that the call does not have, and for one that is given twice."""
+    """Raise RefusedError for query parameters that the call does not have, and for one that is given twice."""
     listed = query_names(request)
     unknown = [] if listed is None else [name for name in request.query_params if name not in listed]
     if unknown:
         choice = f"choose among {', '.join(listed)}" if listed else "this call has none"
-        raise ProblemError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
+        raise RefusedError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
     given = Counter(name for name, _ in request.query_params.multi_items())
     # A list of numbers may come as several parameters, as some client libraries send lists.
     if twice := [name for name, count in given.items() if count > 1 and name != "latent"]:
-        raise ProblemError("invalid-request", f"The query has {twice[0]!r} {given[twice[0]]} times. Send it once.")
+        raise RefusedError("invalid-request", f"The query has {twice[0]!r} {given[twice[0]]} times. Send it once.")

@@ -23,7 +23,7 @@ from shapespace.model.networks import ModelFailedError, NetworkTimeError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from shapespace.refused_values import WANTED
-from shapespace.service.http.problems import ProblemError, problem, shortened
+from shapespace.service.http.problems import problem, shortened
 from shapespace.service.refusals import RefusedError
 
 #: Kind of problem of each exception of the model and of the framework; the message becomes the detail.
@@ -42,12 +42,13 @@ _KINDS: dict[type[Exception], str] = {
     NetworkTimeError: "model-failed",
     ClientDisconnect: "client-closed",
 }
-DOMAIN_ERRORS = (RefusedError, *_KINDS)
+DOMAIN_ERRORS: tuple[type[Exception], ...] = (RefusedError, *_KINDS)
 
 
 def install(app: FastAPI) -> None:
     """Let an application answer every error as a problem."""
-    for exception in DOMAIN_ERRORS:
+    app.add_exception_handler(RefusedError, domain_problem)
+    for exception in _KINDS:
         app.add_exception_handler(exception, domain_problem)
     app.add_exception_handler(StarletteHTTPException, _http)
     app.add_exception_handler(RequestValidationError, _validation)
@@ -55,8 +56,9 @@ def install(app: FastAPI) -> None:
 
 async def domain_problem(request: Request, error: Exception) -> Response:
     """Return one of the DOMAIN_ERRORS as a problem."""
-    kind = error.kind if isinstance(error, RefusedError) else _KINDS[type(error)]
-    return problem(request.scope, kind, str(error))
+    if isinstance(error, RefusedError):
+        return problem(request.scope, error.kind, str(error), error.headers, **error.extensions)
+    return problem(request.scope, _KINDS[type(error)], str(error))
 
 
 async def resumed(
@@ -74,8 +76,6 @@ async def resumed(
 
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, StarletteHTTPException)  # noqa: S101 - narrows the type that the handler is registered for
-    if isinstance(error, ProblemError):
-        return problem(request.scope, error.kind, error.detail, error.headers, **error.extensions)
     path, method = request.url.path, request.method
     if error.status_code == HTTPStatus.NOT_FOUND:
         return problem(request.scope, "not-found", f"Nothing answers at {path}. /openapi.json lists every call.")

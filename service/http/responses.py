@@ -19,7 +19,7 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Asked, Service
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
@@ -106,12 +106,12 @@ class RangedFile(FileResponse):
     """A file of which clients may ask for parts. Starlette refuses a wrong ``Range`` in plain text."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file or a part of it; raises ProblemError for a part that it does not have."""
+        """Send the file or a part of it; raises RefusedError for a part that it does not have."""
 
         async def checked(message: Message) -> None:
             if message.get("status") in (HTTPStatus.BAD_REQUEST, HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE):
                 size = self.headers["content-length"]
-                error = ProblemError(
+                error = RefusedError(
                     "no-such-range", f"The file has bytes 0 to {int(size) - 1}. Correct the header Range."
                 )
                 error.headers = {"Content-Range": f"bytes */{size}"}

@@ -46,7 +46,7 @@ from shapespace.service.limits.sandbox_messages import (
 )
 from shapespace.solve.deadline import Deadline
 
-# Tasks: functions ``(body: bytearray, **facts) -> (facts, arrays)`` that raise FailedError for bad input. They are
+# Tasks: functions ``(body: bytearray, **facts) -> (facts, arrays)`` that raise RefusedError for bad input. They are
 # strings, because only children import these modules, which belong to a layer above this one.
 
 #: Load a bundle that is to be served, and run its networks once.

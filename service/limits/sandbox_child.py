@@ -28,6 +28,7 @@ from shapespace.service.limits.sandbox_messages import (
     receive,
     send,
 )
+from shapespace.service.refusals import RefusedError
 
 #: A function ``(body, **facts)`` that returns facts and arrays.
 Task = Callable[..., tuple[JsonObject, Arrays]]
@@ -77,8 +78,8 @@ def _outcome(connection: Connection, path: str) -> tuple[JsonObject, Arrays]:
             return {"facts": facts}, arrays
     except MemoryError:
         return {"error": "memory"}, {}
-    except FailedError as error:
-        return {"error": error.kind, "sentence": error.sentence[:LONGEST_SENTENCE]}, {}
+    except RefusedError as error:
+        return {"error": error.kind, "sentence": str(error)[:LONGEST_SENTENCE]}, {}
     except Exception as error:
         return {"error": FailedError.UNEXPECTED, "sentence": in_a_line(error)[:LONGEST_SENTENCE]}, {}
 

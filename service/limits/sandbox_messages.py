@@ -49,10 +49,10 @@ class ClosedError(SandboxError):
 
 
 class FailedError(SandboxError):
-    """Bad input that a task reports. The task raises it, and the sandbox raises it again for the caller.
+    """Bad input, for which the task has raised RefusedError.
 
     Attributes:
-        kind: kind of fault, in one word; UNEXPECTED for an exception that the task doesn't handle.
+        kind: kind of that error; UNEXPECTED for an exception that the task doesn't handle.
         sentence: description for people.
     """
 

@@ -22,7 +22,7 @@ from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.recognition import Assumed, FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.limits.sandbox_messages import Arrays, FailedError, JsonObject
+from shapespace.service.limits.sandbox_messages import Arrays, JsonObject
 from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.forms import (
     LONGEST_HEADER,
@@ -209,12 +209,9 @@ def read_in_sandbox(
     known: list[str],
     most: int,
 ) -> tuple[JsonObject, Arrays]:
-    """Run `read_mesh_files` as a task of a sandbox; raises FailedError. Equal faces are sent once."""
+    """Run `read_mesh_files` as a task of a sandbox. Equal faces are sent once."""
     limits = Limits(vertices, faces)
-    try:
-        meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
-    except RefusedError as error:
-        raise FailedError(error.kind, str(error)) from None
+    meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
     arrays: Arrays = {f"vertices {k}": mesh.vertices for k, mesh in enumerate(meshes)}
     arrays |= {f"faces {k}": m.faces for k, m in enumerate(meshes) if not k or m.faces is not meshes[0].faces}
     return {"fields": fields, "names": [mesh.name for mesh in meshes]}, arrays

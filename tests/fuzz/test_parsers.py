@@ -31,7 +31,6 @@ from shapespace.model.correspondence import InvalidMeshError, Matched, limits, m
 from shapespace.model.latent_space import LatentError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.problems import ProblemError
 from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.uploads import read_mesh_files
@@ -377,7 +376,7 @@ def test_ids_of_interpolations(data: st.DataObject) -> None:
 def test_what_is_accepted(accept: str) -> None:
     try:
         assert choose({"glb": "model/gltf-binary", "obj": "model/obj"}, None, accept) in {"glb", "obj"}
-    except ProblemError as error:
+    except RefusedError as error:
         one_line(error)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.service.limits.sandbox_messages import FailedError
+from shapespace.service.refusals import RefusedError
 
 Answer = tuple[dict[str, Any], dict[str, np.ndarray]]
 _kept: list[bytes] = []
@@ -42,7 +42,7 @@ def about(body: bytearray, file: str) -> Answer:
 
 
 def refuse(body: bytearray) -> Answer:
-    raise FailedError("nonsense", "It is\nno mesh.")
+    raise RefusedError("nonsense", "It is\nno mesh.")
 
 
 def mistake(body: bytearray) -> Answer:

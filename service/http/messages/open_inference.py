@@ -19,7 +19,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages.schemas import BoundsField, QualityField
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.fields import Number, Whole
 
 INPUT = "latent"
@@ -139,9 +139,9 @@ class InferenceRequest(_Message):
             names = [output.get("name") for output in given[: len(OUTPUTS) + 1] if isinstance(output, dict)]
             for name in OUTPUTS:
                 if names.count(name) > 1:
-                    raise ProblemError("malformed-request", f"outputs names {name} twice. Name each output once.")
+                    raise RefusedError("malformed-request", f"outputs names {name} twice. Name each output once.")
             if len(given) > len(OUTPUTS):
-                raise ProblemError("malformed-request", f"outputs has {len(given)} entries. Name each output once.")
+                raise RefusedError("malformed-request", f"outputs has {len(given)} entries. Name each output once.")
         return given
 
     @property

@@ -8,8 +8,9 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.service.http.middleware.base import HTTPMiddleware, client_of
-from shapespace.service.http.problems import ProblemError, problem
+from shapespace.service.http.problems import problem
 from shapespace.service.limits.quota import UPLOADS, Quota, QuotaError
+from shapespace.service.refusals import RefusedError
 
 #: Most bytes of all answers that wait to be read.
 UNREAD_BYTES = 256 * 2**20
@@ -54,7 +55,7 @@ class LimitBody(HTTPMiddleware):
                     "The body has a Content-Encoding that isn't read here. Send it uncompressed, or with gzip "
                     "or deflate."
                 )
-                raise ProblemError("unsupported-media-type", detail)
+                raise RefusedError("unsupported-media-type", detail)
             message = await given()
             size = len(message.get("body", b""))
             if received + size > limit:
@@ -62,7 +63,7 @@ class LimitBody(HTTPMiddleware):
             try:
                 self._held.take(client, size)
             except QuotaError:
-                raise ProblemError(
+                raise RefusedError(
                     "busy", "The server holds too many bodies. Try again after the time in Retry-After."
                 ) from None
             received += size
@@ -163,10 +164,10 @@ class LimitUnreadAnswers(HTTPMiddleware):
             self._held.give_back(client, held)
 
 
-def _damaged() -> ProblemError:
+def _damaged() -> RefusedError:
     detail = "The body isn't compressed as its Content-Encoding says, or it is cut short. Send all of it."
-    return ProblemError("malformed-request", detail)
+    return RefusedError("malformed-request", detail)
 
 
-def _too_large(limit: int) -> ProblemError:
-    return ProblemError("body-too-large", f"The body is over the limit of {limit} bytes. Send less in each request.")
+def _too_large(limit: int) -> RefusedError:
+    return RefusedError("body-too-large", f"The body is over the limit of {limit} bytes. Send less in each request.")

@@ -39,8 +39,8 @@ from shapespace.service.http.messages.mesh_query import (
 )
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.negotiation import choose, listed
-from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.fields import DIGITS, WholeText
 from shapespace.service.use_cases.sequence import (
@@ -114,7 +114,7 @@ async def get_interpolation(
     if fps is not None and not (written_as and written_as.timed):
         timed = ", ".join(name for name, each in SEQUENCE_FORMATS.items() if each.timed)
         said = f"{chosen.upper()} files don't say when a frame is shown."
-        raise ProblemError("invalid-request", f"{said} For fps ask for one of {timed}.")
+        raise RefusedError("invalid-request", f"{said} For fps ask for one of {timed}.")
     polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
     colour_by = color.on(model)
