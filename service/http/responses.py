@@ -17,7 +17,7 @@ from shapespace.model.latent_space import CheckedCode
 from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
+from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import Asked, Service
 from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
@@ -46,19 +46,16 @@ async def cached_response(
     if unchanged := not_modified(asked.request, tag):
         return unchanged
     service = asked.service
-    answer, seconds = service.answers.get(tag), _CACHED
-    service.metrics.looked_up(found=answer is not None)
-    if answer is None:
-        written = await compute()
-        assert isinstance(written.content, bytes)  # noqa: S101 - narrows the type: what is cached is small
-        headers = file_headers(written, filename)
-        if written.facts:
-            headers["Shape-Color"] = dump_json(written.facts).decode()
-        answer, seconds = CachedAnswer(written.content, headers), written.seconds
-        service.answers.keep(tag, answer)
-        service.metrics.timed(seconds)
-    headers = {**cache_headers(tag), **answer.headers, **_timing(seconds)}
-    return Response(answer.content, headers=headers, media_type=media_type)
+    kept = service.answers.get(tag)
+    service.metrics.looked_up(found=kept is not None)
+    written = kept or await compute()
+    if not kept:
+        service.answers.keep(tag, written)
+        service.metrics.timed(written.seconds)
+    headers = {**cache_headers(tag), **file_headers(written, filename), **_timing(_CACHED if kept else written.seconds)}
+    if written.facts:
+        headers["Shape-Color"] = dump_json(written.facts).decode()
+    return Response(written.content, headers=headers, media_type=media_type)
 
 
 async def shape_response(asked: Asked, model: ShapeModel, wanted: ShapeRequest) -> Response:

@@ -11,13 +11,13 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, asynccontextmanager, contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from shapespace.service.limits.quota import Quota, QuotaError
+from shapespace.service.limits.quota import Quota
 from shapespace.service.limits.turns import Turns
 from shapespace.service.refusals import RefusedError
 from shapespace.solve.deadline import Deadline
@@ -28,6 +28,7 @@ T = TypeVar("T")
 SEARCH_GRACE_SECONDS = 5.0
 #: Bytes that all answers with many shapes may use together.
 MEMORY = 384 * 2**20
+_FULL = "All workers are busy and the queue is full"
 #: What a client can do whose request was not answered by its deadline.
 ADVICE = "Ask for fewer shapes at once, stream the frames as JSON lines, or try again when the server is less busy."
 
@@ -53,8 +54,7 @@ class Workers:
         self.threads, self.deadline = max(2, threads), deadline
         self.pool = ThreadPoolExecutor(self.threads, thread_name_prefix="shapespace")
         self.turns = Turns(self.threads)
-        self.places, self.streams = Quota(threads + queue), Quota(threads + queue)
-        self.memory = Quota(MEMORY)
+        self.places, self.streams, self.memory = (Quota(n, _FULL) for n in (threads + queue, threads + queue, MEMORY))
         self.calls: set[Call] = set()
         self.ending = False
 
@@ -91,44 +91,28 @@ class Caller:
 
         The error of a late request ends with the advice.
         """
-        with self._place(self.workers.places), self._call(advice) as call:
+        with self.workers.places.held(self.client), self._call(advice) as call:
             watching = asyncio.create_task(self._watch(call))
             try:
                 yield call
             finally:
                 watching.cancel()
 
-    @contextmanager
-    def stream(self) -> Iterator[None]:
+    def stream(self) -> AbstractContextManager[None]:
         """Admit a streamed answer for the duration of the block; raises RefusedError, busy."""
-        with self._place(self.workers.streams):
-            yield
+        return self.workers.streams.held(self.client)
 
     @contextmanager
     def holding(self, size: int) -> Iterator[ExitStack]:
         """Reserve bytes until the block ends, or a new owner closes the stack; raises RefusedError, busy."""
-        with ExitStack() as held:
-            held.enter_context(self._place(self.workers.memory, size))
-            yield held
+        with ExitStack() as stack:
+            stack.enter_context(self.workers.memory.held(self.client, size))
+            yield stack
 
     async def run(self, function: Callable[[Call], T]) -> T:
         """Run a function in a thread, within a deadline of its own; raises as `Call.run`."""
         with self._call() as call:
             return await call.run(function)
-
-    @contextmanager
-    def _place(self, quota: Quota, amount: int = 1) -> Iterator[None]:
-        try:
-            quota.take(self.client, amount)
-        except QuotaError:
-            whose = "" if quota.used + amount > quota.limit else " for this client"
-            raise RefusedError(
-                "busy", f"All workers are busy and the queue is full{whose}. Try again after the time in Retry-After."
-            ) from None
-        try:
-            yield
-        finally:
-            quota.give_back(self.client, amount)
 
     @contextmanager
     def _call(self, advice: str = ADVICE) -> Iterator[Call]:

@@ -157,7 +157,7 @@ def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
     # No request or bundle is known to cause this.
     repository = ModelRepository(tmp_path)  # of no bundles
     registry = CollectorRegistry()
-    metrics = Metrics(registry, repository, Workers(1, 0, 1), Quota(10))
+    metrics = Metrics(registry, repository, Workers(1, 0, 1), Quota(10, "full"))
 
     def broken() -> Changes:
         raise RuntimeError
@@ -176,7 +176,7 @@ def test_requests_for_a_reload_before_it_begins_are_one(tmp_path: Path) -> None:
         return Changes()
 
     repository.reload = count  # type: ignore[method-assign]
-    reloader = Reloader(repository, Metrics(CollectorRegistry(), repository, Workers(1, 0, 1), Quota(10)))
+    reloader = Reloader(repository, Metrics(CollectorRegistry(), repository, Workers(1, 0, 1), Quota(10, "full")))
 
     async def ask(times: int) -> None:
         await asyncio.gather(*(reloader.reload() for _ in range(times)))
