@@ -64,7 +64,7 @@ _UNREADABLE = DiedError("its answer can't be read")
 
 
 class Sandbox:
-    """At most so many child processes for one task, which start when they are needed.
+    """A limited number of child processes for one task, which start when they are needed.
 
     Any number of threads can call it. A call waits until a child is free.
     """

@@ -80,7 +80,7 @@ def send(connection: Connection, message: Mapping[str, Any], arrays: Arrays | No
 
 
 def receive(connection: Connection, most: int = 0) -> tuple[JsonObject, Arrays]:
-    """Return the next message, and its arrays, which have at most so many bytes together.
+    """Return the next message, and its arrays, which have at most ``most`` bytes together.
 
     Raises EOFError at the end, and ValueError, TypeError, LookupError or OSError if it is no message.
     """
