@@ -41,12 +41,8 @@ def cpu_quota(cgroup: Path = Path("/sys/fs/cgroup")) -> int:
         quota, period = (cgroup / "cpu.max").read_text().split()
         share = float(quota) / float(period)  # "max" is no number, and means no quota
     except (OSError, ValueError):
-        try:  # control groups of version 1; −1 means no quota
-            quota, period = ((cgroup / "cpu" / f"cpu.cfs_{x}_us").read_text() for x in ("quota", "period"))
-            share = float(quota) / float(period)
-        except (OSError, ValueError):
-            share = -1.0
-    return max(1, min(count, round(share))) if share > 0 else count
+        return count
+    return max(1, min(count, round(share)))
 
 
 def default_models_dir() -> Path:

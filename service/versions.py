@@ -41,21 +41,35 @@ class DefaultVersions:
     @classmethod
     def parse(cls, text: str) -> DefaultVersions:
         """Read a list of default versions; raises DefaultVersionsError."""
-        given: dict[str, list[str]] = {}
-        name = None
+        shares: dict[str, dict[int, float]] = {}
+        name = ""
         for entry in filter(None, (part.strip() for part in re.split(r"[,\n]", text))):
-            before, separator, rest = entry.partition("=")
+            before, separator, rest = entry.rpartition("=")
             if separator:
                 name = before.strip()
                 if not re.fullmatch(NAME_PATTERN, name):
                     raise DefaultVersionsError(f"{name[:64]!r} is not the name of a model. {EXAMPLE}.")
-                if name in given:
+                if name in shares:
                     raise DefaultVersionsError(f"{name} is named twice. Name each model once.")
-                given[name] = []
-            if name is None:
+            elif not name:
                 raise DefaultVersionsError(f"{entry[:64]!r} has no name of a model. {EXAMPLE}.")
-            given[name].append(rest.strip() if separator else entry)
-        return cls({name: _shares(name, entries) for name, entries in given.items()})
+            version, colon, share = (part.strip() for part in rest.partition(":"))
+            fault = f"{name}={rest.strip()[:64]} names no"
+            if not re.fullmatch(VERSION_PATTERN, version):
+                raise DefaultVersionsError(f"{fault} version. A version is a whole number. {EXAMPLE}.")
+            if colon and not re.fullmatch(r"[0-9]{1,3}(\.[0-9]+)?", share):
+                raise DefaultVersionsError(f"{fault} share in per cent. {EXAMPLE}.")
+            if int(version) in shares.setdefault(name, {}):
+                raise DefaultVersionsError(f"{name} names version {version} twice. Name each version once.")
+            shares[name][int(version)] = float(share) if colon else _WHOLE
+        for name, each in shares.items():
+            if not math.isclose(total := sum(each.values()), _WHOLE):
+                raise DefaultVersionsError(
+                    f"The shares of {name} add up to {total:g} per cent, where a version without a share has 100. "
+                    "Let them add up to 100."
+                )
+        # In whatever order they are written.
+        return cls({name: dict(sorted(each.items())) for name, each in shares.items()})
 
     @classmethod
     def read(cls, file: Path) -> DefaultVersions:
@@ -131,22 +145,3 @@ class DefaultVersions:
 
     def _served(self, name: str, served: Collection[int]) -> dict[int, float]:
         return {version: share for version, share in self.shares[name].items() if share and version in served}
-
-
-def _shares(name: str, entries: list[str]) -> dict[int, float]:
-    """Read the versions of one model, as ``3`` or as ``3:95`` and ``4:5``."""
-    shares: dict[int, float] = {}
-    for entry in entries:
-        version, separator, share = (part.strip() for part in entry.partition(":"))
-        if not re.fullmatch(VERSION_PATTERN, version):
-            raise DefaultVersionsError(f"{name}={entry[:64]} names no version. A version is a whole number. {EXAMPLE}.")
-        if int(version) in shares:
-            raise DefaultVersionsError(f"{name} names version {version} twice. Name each version once.")
-        if not separator and len(entries) > 1:
-            raise DefaultVersionsError(f"{name} names several versions. Give each a share: {EXAMPLE[6:]}.")
-        if separator and not re.fullmatch(r"[0-9]{1,3}(\.[0-9]+)?", share):
-            raise DefaultVersionsError(f"{name}={entry[:64]} names no share in per cent. {EXAMPLE}.")
-        shares[int(version)] = float(share) if separator else _WHOLE
-    if not math.isclose(total := sum(shares.values()), _WHOLE):
-        raise DefaultVersionsError(f"The shares of {name} add up to {total:g} per cent. Let them add up to 100.")
-    return dict(sorted(shares.items()))  # in whatever order they are written

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 
 from fastapi import Depends, FastAPI
+from prometheus_client import CollectorRegistry
 from starlette.middleware import Middleware
 
 from shapespace import __version__
@@ -22,7 +23,7 @@ from shapespace.service.http.middleware.memory import LimitBody, LimitUnreadAnsw
 from shapespace.service.http.middleware.observe import QUIET, Observe
 from shapespace.service.http.routes import codes, interpolations, models, open_inference, operation, page, shapes
 from shapespace.service.limits.quota import UPLOADS
-from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox import READ, Sandbox
 from shapespace.service.limits.workers import Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
@@ -60,12 +61,12 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
                 settings.default_versions,
                 settings.default_versions_file,
             )
-            metrics = Metrics(repository, workers, connections.quota)
+            metrics = Metrics(app.state.metrics, repository, workers, connections.quota)
             connections.on_refusal = metrics.refused
             reloader = Reloader(repository, metrics)
             answers = AnswerCache(settings.cache)
-            sandbox = Sandbox(min(settings.workers, UPLOADS))
-            sandbox.prepare("read")
+            sandbox = Sandbox(min(settings.workers, UPLOADS), READ)
+            sandbox.prepare()
             app.state.service = Service(settings, repository, workers, connections, metrics, reloader, answers, sandbox)
             # Threads that read bodies and folders, apart from the workers.
             asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(2, thread_name_prefix="reading"))
@@ -93,6 +94,7 @@ def create_app(settings: Settings | None = None, validator: BundleValidator | No
         redoc_url=None,
         openapi_url=None,
     )
+    app.state.metrics = CollectorRegistry()
     error_handlers.install(app)
     calls = (models, shapes, codes, interpolations, open_inference, operation, page)
     routers = [module.router for module in calls]
@@ -109,7 +111,7 @@ def _middleware(settings: Settings) -> list[Middleware]:
         Middleware(Observe),
         Middleware(LimitUnreadAnswers),
         Middleware(Compress),
-        Middleware(RequireHost, hosts=_hosts(settings)),
+        *([Middleware(RequireHost, hosts=hosts)] if (hosts := _hosts(settings)) else []),
         *([Middleware(RequireKey, key=settings.api_key)] if settings.api_key else []),
         Middleware(LimitBody, limit=settings.max_body, upload=settings.max_upload),
     ]

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 
 from cachetools import LRUCache
 from fastapi import Request, Response
 
 from shapespace import __version__
 from shapespace.service.http.negotiation import listed
+from shapespace.service.use_cases.batch import EncodedFile
 
 
 def entity_tag(*parts: str | bytes) -> str:
@@ -35,26 +34,19 @@ def not_modified(request: Request, tag: str) -> Response | None:
     return Response(status_code=304, headers=cache_headers(tag)) if tag in known else None
 
 
-@dataclass(frozen=True)
-class CachedAnswer:
-    """A file in the cache, and the headers of every answer with it."""
-
-    content: bytes
-    headers: Mapping[str, str]
-
-    @property
-    def size(self) -> int:
-        """Approximate number of bytes in memory."""
-        return len(self.content) + sum(len(name) + len(value) for name, value in self.headers.items()) + 1024
-
-
-class AnswerCache(LRUCache[str, CachedAnswer]):
+class AnswerCache(LRUCache[str, EncodedFile]):
     """The most recently used answers by entity tag, of ``limit`` bytes together; for the event loop only."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(limit, getsizeof=lambda answer: answer.size)
+        super().__init__(limit, getsizeof=_size)
 
-    def keep(self, tag: str, answer: CachedAnswer) -> None:
+    def keep(self, tag: str, answer: EncodedFile) -> None:
         """Keep an answer in place of the least recently used ones, unless it is over the limit by itself."""
         with suppress(ValueError):
             self[tag] = answer
+
+
+def _size(answer: EncodedFile) -> int:
+    """Return the approximate number of bytes of an answer in memory."""
+    assert isinstance(answer.content, bytes)  # noqa: S101 - narrows the type: what is cached is small
+    return len(answer.content) + 2048

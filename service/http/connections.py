@@ -21,8 +21,9 @@ import h11
 from uvicorn.protocols.http.h11_impl import STATUS_PHRASES, H11Protocol
 
 from shapespace.service.http.problems import KINDS, MEDIA_TYPE, description
-from shapespace.service.limits.quota import Quota, QuotaError, client_name
+from shapespace.service.limits.quota import Quota, client_name
 from shapespace.service.logs import RateLimitedLog
+from shapespace.service.refusals import RefusedError
 
 #: File handles that are reserved for other uses than connections.
 SPARE_HANDLES = 100
@@ -51,7 +52,8 @@ class Connections:
     """
 
     def __init__(self, most: int, seconds: float, proxies: Sequence[str] = ()) -> None:
-        self.quota, self.seconds = Quota(max(1, min(most, _file_handles() - SPARE_HANDLES))), seconds
+        self.quota = Quota(max(1, min(most, _file_handles() - SPARE_HANDLES)), "There are too many connections")
+        self.seconds = seconds
         #: Called with the kind of problem of every refusal, to count it.
         self.on_refusal: Callable[[str], None] = lambda kind: None
         self._proxies = [ipaddress.ip_network(proxy) for proxy in proxies]
@@ -96,8 +98,8 @@ class Connection(H11Protocol):
         try:
             self._all.quota.take(self._client)
             self._counted = True
-        except QuotaError:
-            self._refuse("busy", "There are too many connections. Try again after the time in Retry-After.")
+        except RefusedError as error:
+            self._refuse(error.kind, str(error))
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Count the connection out."""

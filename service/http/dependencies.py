@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 from pydantic import Field, WithJsonSchema
-from starlette.exceptions import HTTPException
 
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import AnswerCache
 from shapespace.service.http.connections import Connections
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.messages.open_inference import ModelStatistics
 from shapespace.service.http.version_key import version_key
 from shapespace.service.limits.quota import client_name
 from shapespace.service.limits.sandbox import Sandbox
-from shapespace.service.limits.workers import Caller, DisconnectedError, Workers
+from shapespace.service.limits.workers import Caller, Workers
 from shapespace.service.operation.metrics import Metrics
 from shapespace.service.operation.reloading import Reloader
-from shapespace.service.operation.statistics import InferenceTally
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import Settings
 
@@ -41,9 +40,7 @@ class Service:
     answers: AnswerCache
     sandbox: Sandbox
     #: Inferences by name and version of the model.
-    inferences: defaultdict[tuple[str, str], InferenceTally] = field(
-        default_factory=lambda: defaultdict(InferenceTally)
-    )
+    inferences: dict[tuple[str, str], ModelStatistics] = field(default_factory=dict)
     #: Whether the server is shutting down, so that clients should use another one.
     draining: bool = False
 
@@ -57,22 +54,34 @@ async def _service(request: Request) -> Service:
 ServiceDependency = Annotated[Service, Depends(_service)]
 
 
-async def _caller(request: Request) -> Caller:
+@dataclass(frozen=True)
+class Asked:
+    """A request, its caller, and the service that it is for."""
+
+    service: Service
+    request: Request
+    caller: Caller
+
+
+async def _asked(request: Request) -> Asked:
     async def gone() -> Exception:
         try:
             while (await request.receive())["type"] != "http.disconnect":
                 pass
-        except HTTPException as error:  # the rest of the body is over the limit
+        except RefusedError as error:  # the rest of the body is over the limit
             return error
-        return DisconnectedError("The client closed the connection before its answer was ready.")
+        return RefusedError("client-closed", "The client closed the connection before its answer was ready.")
 
-    return Caller(client_name(request.client.host) if request.client else "", gone)
+    service = await _service(request)
+    client = client_name(request.client.host) if request.client else ""
+    return Asked(service, request, Caller(service.workers, client, gone))
 
 
-CallerDependency = Annotated[Caller, Depends(_caller)]
+AskedDependency = Annotated[Asked, Depends(_asked)]
 
 ModelName = Annotated[str, Path(description="Name of a model.", examples=["freaky-torus"])]
-MeshQuery = Annotated[
+MeshQuery = Annotated[MeshChoice, Query(alias="mesh", description="Which mesh to answer, if the model has a fine one.")]
+MeshOfBody = Annotated[
     MeshChoice | None, Query(alias="mesh", description="Overrides `mesh` in the body: `fine` or `coarse`.")
 ]
 QualityQuery = Annotated[
@@ -129,13 +138,13 @@ def query_names(request: Request) -> list[str] | None:
 
 
 async def known_query(request: Request) -> None:
-    """Raise ProblemError for query parameters that the call does not have, and for one that is given twice."""
+    """Raise RefusedError for query parameters that the call does not have, and for one that is given twice."""
     listed = query_names(request)
     unknown = [] if listed is None else [name for name in request.query_params if name not in listed]
     if unknown:
         choice = f"choose among {', '.join(listed)}" if listed else "this call has none"
-        raise ProblemError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
+        raise RefusedError("invalid-request", f"There is no query parameter {unknown[0]!r} here: {choice}.")
     given = Counter(name for name, _ in request.query_params.multi_items())
     # A list of numbers may come as several parameters, as some client libraries send lists.
     if twice := [name for name, count in given.items() if count > 1 and name != "latent"]:
-        raise ProblemError("invalid-request", f"The query has {twice[0]!r} {given[twice[0]]} times. Send it once.")
+        raise RefusedError("invalid-request", f"The query has {twice[0]!r} {given[twice[0]]} times. Send it once.")

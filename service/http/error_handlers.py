@@ -23,54 +23,31 @@ from shapespace.model.networks import ModelFailedError, NetworkTimeError
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.vertex_uncertainty import InvalidCovarianceError
 from shapespace.refused_values import WANTED
-from shapespace.service.http.problems import ProblemError, problem, shortened
-from shapespace.service.limits.workers import BusyError, DeadlineError, DisconnectedError, EndingError
-from shapespace.service.repository.repository import UnknownModelError, UnknownVersionError
-from shapespace.service.use_cases.animation import PathTooLongError, UnknownInterpolationError
-from shapespace.service.use_cases.batch import NoCodesError, TooManyCodesError
-from shapespace.service.use_cases.forms import FormFieldError, UnreadableFormError
-from shapespace.service.use_cases.sequence import TooManyFramesError, UnknownFrameError
-from shapespace.service.use_cases.shape_formats import NoRoomError
-from shapespace.service.use_cases.uploads import UnknownFormatError, UnusableMeshError
+from shapespace.service.http.problems import problem, shortened
+from shapespace.service.refusals import RefusedError
 
-#: Kind of problem of each exception of the model and the use cases; the message becomes the detail.
+#: Kind of problem of each exception of the model and of the framework; the message becomes the detail.
 _KINDS: dict[type[Exception], str] = {
-    UnknownModelError: "unknown-model",
-    UnknownVersionError: "unknown-version",
-    UnknownInterpolationError: "unknown-interpolation",
-    UnknownFrameError: "unknown-frame",
     WrongLengthError: "wrong-length",
     NotFiniteError: "not-finite",
     OutOfBoundsError: "out-of-bounds",
     InvalidFixedError: "invalid-request",
     InvalidCovarianceError: "invalid-request",
-    NoCodesError: "invalid-request",
-    TooManyCodesError: "too-many-codes",
-    TooManyFramesError: "too-many-frames",
-    PathTooLongError: "path-too-long",
     InvalidTargetError: "invalid-request",
-    UnreadableFormError: "malformed-request",
-    FormFieldError: "invalid-request",
-    UnknownFormatError: "unsupported-media-type",
-    UnusableMeshError: "invalid-mesh",
     InvalidMeshError: "invalid-mesh",
     InvalidScanError: "invalid-scan",
     NoTangentSpaceError: "no-tangent-space",
     PeriodicError: "periodic",
-    BusyError: "busy",
-    DeadlineError: "deadline-passed",
-    NoRoomError: "no-room",
     ModelFailedError: "model-failed",
     NetworkTimeError: "model-failed",
-    DisconnectedError: "client-closed",
     ClientDisconnect: "client-closed",
-    EndingError: "not-ready",
 }
-DOMAIN_ERRORS = tuple(_KINDS)
+DOMAIN_ERRORS: tuple[type[Exception], ...] = (RefusedError, *_KINDS)
 
 
 def install(app: FastAPI) -> None:
     """Let an application answer every error as a problem."""
+    app.add_exception_handler(RefusedError, domain_problem)
     for exception in _KINDS:
         app.add_exception_handler(exception, domain_problem)
     app.add_exception_handler(StarletteHTTPException, _http)
@@ -79,6 +56,8 @@ def install(app: FastAPI) -> None:
 
 async def domain_problem(request: Request, error: Exception) -> Response:
     """Return one of the DOMAIN_ERRORS as a problem."""
+    if isinstance(error, RefusedError):
+        return problem(request.scope, error.kind, str(error), error.headers, **error.extensions)
     return problem(request.scope, _KINDS[type(error)], str(error))
 
 
@@ -97,8 +76,6 @@ async def resumed(
 
 async def _http(request: Request, error: Exception) -> Response:
     assert isinstance(error, StarletteHTTPException)  # noqa: S101 - narrows the type that the handler is registered for
-    if isinstance(error, ProblemError):
-        return problem(request.scope, error.kind, error.detail, error.headers, **error.extensions)
     path, method = request.url.path, request.method
     if error.status_code == HTTPStatus.NOT_FOUND:
         return problem(request.scope, "not-found", f"Nothing answers at {path}. /openapi.json lists every call.")

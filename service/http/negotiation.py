@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from starlette.datastructures import Headers
 
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 
 #: Number of media ranges of an ``Accept`` that are read, the first ones; browsers send less than ten.
 MOST_RANGES = 100
@@ -29,7 +29,7 @@ def choose(
     accept: str | None,
     unavailable: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Return the name of the format to answer in; raises ProblemError, not-acceptable, with the choices.
+    """Return the name of the format to answer in; raises RefusedError, not-acceptable, with the choices.
 
     Args:
         formats: media type of each format by name. The first is the default. ``Accept`` gets the first of two
@@ -73,9 +73,9 @@ def _weight(media_type: str, ranges: list[tuple[str, float]]) -> float:
     return 0.0
 
 
-def _not_acceptable(formats: Mapping[str, str], fault: str) -> ProblemError:
+def _not_acceptable(formats: Mapping[str, str], fault: str) -> RefusedError:
     choices = [{"format": name, "media_type": media_type} for name, media_type in formats.items()]
     listed = ", ".join(f"{name} ({media_type})" for name, media_type in formats.items())
-    error = ProblemError("not-acceptable", f"{fault}. Choose one of {listed} by ?format= or Accept.", choices=choices)
+    error = RefusedError("not-acceptable", f"{fault}. Choose one of {listed} by ?format= or Accept.", choices=choices)
     error.headers = {"Vary": "Accept"}
     return error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from fastapi import HTTPException, Response
+from fastapi import Response
 from starlette.types import Scope
 
 from shapespace.service.use_cases.shape_formats import dump_json
@@ -26,7 +26,6 @@ KINDS = {
     "malformed-request": ProblemKind(400, "The request can't be read"),
     "unauthorized": ProblemKind(401, "No valid API key"),
     "cross-origin": ProblemKind(400, "Not allowed to this page"),
-    "no-host": ProblemKind(400, "No Host, or several"),
     "not-found": ProblemKind(404, "Nothing is here"),
     "unknown-model": ProblemKind(404, "Unknown model"),
     "unknown-version": ProblemKind(404, "Unknown version of the model"),
@@ -67,14 +66,6 @@ _HEADERS = {
     "not-ready": {"Retry-After": "1"},
     "unauthorized": {"WWW-Authenticate": "Bearer"},
 }
-
-
-class ProblemError(HTTPException):
-    """A problem that a route or a middleware finds: a key of KINDS, what to do, and further members of the answer."""
-
-    def __init__(self, kind: str, detail: str, **extensions: Any) -> None:
-        super().__init__(KINDS[kind].status, detail)
-        self.kind, self.extensions = kind, extensions
 
 
 def problem(

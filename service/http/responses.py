@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import asdict
+from functools import partial
 from http import HTTPStatus
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
-from fastapi import Request, Response
+from fastapi import Response
 from fastapi.responses import FileResponse, StreamingResponse
 from starlette.types import Message, Receive, Scope, Send
 
@@ -17,13 +17,10 @@ from shapespace.model.latent_space import CheckedCode
 from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.caching import CachedAnswer, cache_headers, entity_tag, not_modified
-from shapespace.service.http.dependencies import Service
-from shapespace.service.http.problems import ProblemError
-from shapespace.service.limits.workers import Caller
-from shapespace.service.tracing import record_stages
+from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
+from shapespace.service.http.dependencies import Asked, Service
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, Timings
-from shapespace.service.use_cases.codes import Found
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest, shape_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 
@@ -31,69 +28,44 @@ from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, dump_json
 _CACHED = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 
 
-def timing(service: Service, seconds: Timings) -> dict[str, str]:
-    """Return the header ``Server-Timing``, in milliseconds, and count the same times in the metrics."""
-    service.metrics.timed(seconds)
-    return _server_timing(seconds)
+def file_headers(written: EncodedFile, filename: str = "") -> dict[str, str]:
+    """Return headers with the diagnostics of a file, if there are any, and its name."""
+    headers = {"Shape-Diagnostics": dump_json(written.diagnostics).decode()} if written.diagnostics else {}
+    return headers | ({"Content-Disposition": f'inline; filename="{filename}"'} if filename else {})
 
 
-def _server_timing(seconds: Timings) -> dict[str, str]:
+def _timing(seconds: Timings) -> dict[str, str]:
+    """Return the header ``Server-Timing``, in milliseconds."""
     return {"Server-Timing": ", ".join(f"{stage};dur={1e3 * duration:.3f}" for stage, duration in seconds.items())}
 
 
-def file_headers(diagnostics: Mapping[str, Any], filename: str) -> dict[str, str]:
-    """Return the headers of an answer that is a file."""
-    return {**diagnostics_header(diagnostics), "Content-Disposition": f'inline; filename="{filename}"'}
-
-
-def diagnostics_header(diagnostics: Mapping[str, Any]) -> dict[str, str]:
-    """Return the header ``Shape-Diagnostics``."""
-    return {"Shape-Diagnostics": dump_json(diagnostics).decode()}
-
-
-def found_response(service: Service, found: Found) -> Response:
-    """Return the result of a search, with its time."""
-    record_stages(found.seconds)
-    return Response(found.content, headers=timing(service, found.seconds), media_type="application/json")
-
-
 async def cached_response(
-    service: Service,
-    request: Request,
-    tag: str,
-    media_type: str,
-    compute: Callable[[], Awaitable[tuple[CachedAnswer, Timings]]],
+    asked: Asked, tag: str, media_type: str, filename: str, compute: Callable[[], Awaitable[EncodedFile]]
 ) -> Response:
     """Return a file from the cache, computed first where it is not there; 304 where the client has it already."""
-    if unchanged := not_modified(request, tag):
+    if unchanged := not_modified(asked.request, tag):
         return unchanged
-    answer, times = service.answers.get(tag), _server_timing(_CACHED)
-    service.metrics.looked_up(found=answer is not None)
-    if answer is None:
-        answer, seconds = await compute()
-        service.answers.keep(tag, answer)
-        times = timing(service, seconds)
-    headers = {**cache_headers(tag), **answer.headers, **times}
-    return Response(answer.content, headers=headers, media_type=media_type)
+    service = asked.service
+    kept = service.answers.get(tag)
+    service.metrics.looked_up(found=kept is not None)
+    written = kept or await compute()
+    if not kept:
+        service.answers.keep(tag, written)
+        service.metrics.timed(written.seconds)
+    headers = {**cache_headers(tag), **file_headers(written, filename), **_timing(_CACHED if kept else written.seconds)}
+    if written.facts:
+        headers["Shape-Color"] = dump_json(written.facts).decode()
+    return Response(written.content, headers=headers, media_type=media_type)
 
 
-async def shape_response(
-    service: Service, request: Request, caller: Caller, model: ShapeModel, wanted: ShapeRequest
-) -> Response:
+async def shape_response(asked: Asked, model: ShapeModel, wanted: ShapeRequest) -> Response:
     """Return one shape as a file, from the cache where it is there."""
-
-    async def compute() -> tuple[CachedAnswer, Timings]:
-        found = await shape_file(service.workers, caller, model, wanted)
-        headers = file_headers(asdict(found.diagnostics), f"{model.manifest.name}.{wanted.format}")
-        if found.legend:
-            headers["Shape-Color"] = dump_json(found.legend).decode()
-        return CachedAnswer(found.content, headers), found.seconds
-
     options = tag_options(wanted.quality, wanted.colour_by, wanted.topology, wanted.examples)
     if place := wanted.place:
         options += ["place", *(np.asarray(part).tobytes() for part in (place.rotation, place.translation, place.scale))]
     tag = entity_tag("shape", model.digest, _code_bytes(wanted.code), wanted.mesh, wanted.format, *options)
-    return await cached_response(service, request, tag, SHAPE_FORMATS[wanted.format].media_type, compute)
+    media_type, filename = SHAPE_FORMATS[wanted.format].media_type, f"{model.manifest.name}.{wanted.format}"
+    return await cached_response(asked, tag, media_type, filename, partial(shape_file, asked.caller, model, wanted))
 
 
 def tag_options(
@@ -116,9 +88,12 @@ def _code_bytes(code: CheckedCode | None) -> bytes:
     return b"" if code is None else code[0].tobytes()
 
 
-def encoded_response(service: Service, written: EncodedFile, headers: Mapping[str, str], media_type: str) -> Response:
-    """Return a file made from many codes. A large file is sent as fast as the client reads it."""
-    headers = {**headers, **timing(service, written.seconds)}
+def encoded_response(
+    service: Service, written: EncodedFile, media_type: str, headers: Mapping[str, str] = MappingProxyType({})
+) -> Response:
+    """Return a file with its time, which the metrics count. A large file is sent as fast as the client reads it."""
+    service.metrics.timed(written.seconds)
+    headers = {**headers, **_timing(written.seconds)}
     if isinstance(written.content, bytes):
         return Response(written.content, headers=headers, media_type=media_type)
     return _PiecewiseResponse(written.content, headers, media_type)
@@ -128,12 +103,12 @@ class RangedFile(FileResponse):
     """A file of which clients may ask for parts. Starlette refuses a wrong ``Range`` in plain text."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file or a part of it; raises ProblemError for a part that it does not have."""
+        """Send the file or a part of it; raises RefusedError for a part that it does not have."""
 
         async def checked(message: Message) -> None:
             if message.get("status") in (HTTPStatus.BAD_REQUEST, HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE):
                 size = self.headers["content-length"]
-                error = ProblemError(
+                error = RefusedError(
                     "no-such-range", f"The file has bytes 0 to {int(size) - 1}. Correct the header Range."
                 )
                 error.headers = {"Content-Range": f"bytes */{size}"}

@@ -18,10 +18,10 @@ from typing import Any
 
 import uvicorn
 from fastapi import FastAPI
+from prometheus_client import start_http_server
 
 from shapespace.service.http.connections import HEAD_BYTES, IDLE_SECONDS, Connection
 from shapespace.service.logs import RateLimitedLog
-from shapespace.service.operation.metrics_port import MetricsPort
 from shapespace.service.repository.repository import ModelRepository
 from shapespace.service.settings import PREFIX, Settings
 
@@ -84,22 +84,19 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to listen, and print the address."""
-        host, port, metrics_port = self._settings.host, self._settings.port, self._settings.metrics_port
+        host, port, setting = self._settings.host, self._settings.port, "PORT"
         try:
             self._listeners = _bound(host, port)
-            metrics = None
-            if metrics_port is not None:
-                port = metrics_port
-                metrics = MetricsPort(host, port)
+            if self._settings.metrics_port is not None:
+                port, setting = self._settings.metrics_port, "METRICS_PORT"
+                metrics, _ = start_http_server(port, host, self._app.state.metrics)
+                logger.info("/metrics is at port %d too, without a key", metrics.server_port)
         except OSError as error:
-            setting = "PORT" if port == self._settings.port else "METRICS_PORT"
             why = os.strerror(error.errno) if error.errno in _REMEDIES else error.strerror
             remedy = _REMEDIES.get(error.errno or 0, "").format(setting=f"{PREFIX}{setting}")
             logger.error("can't listen on %s, port %d: %s%s", host, port, why, remedy)
             raise SystemExit(STARTUP_FAILURE) from None
         await super().startup(sockets=self._listeners)
-        if metrics:
-            metrics.serve(self._app.state.service.metrics.registry)
         loop = asyncio.get_running_loop()
         loop.add_signal_handler(signal.SIGHUP, self._hang_up)
         loop.set_exception_handler(self._report)

@@ -12,7 +12,7 @@ from fastapi.exceptions import RequestValidationError
 
 from shapespace.service.http.messages.binary_tensors import HEADER
 from shapespace.service.http.messages.bodies import SMALL, gather, parse
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 
 #: Calls whose body is a file, by the end of their path.
 UPLOADS = ("/encode", "/fit")
@@ -40,7 +40,7 @@ def _key(json: bytes, body: bytes) -> bytes:
     code: Sequence[object] | None = None
     try:
         message = parse(json)
-    except (ProblemError, RequestValidationError):
+    except (RefusedError, RequestValidationError):
         return body  # the route reports the fault
     match message:
         case {"latent": list(first)} | {"latents": [list(first), *_]} | {"keyframes": [list(first), *_]}:

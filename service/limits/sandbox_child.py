@@ -6,38 +6,38 @@ It imports little except what a task needs, because the memory limit counts from
 from __future__ import annotations
 
 import importlib
-import math
 import os
 import resource
 import select
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 from shapespace.service.limits.process_memory import mapped_size, resident_size, trim_heap, tune_malloc
-from shapespace.service.limits.sandbox_errors import FailedError, in_a_line
-from shapespace.service.limits.sandbox_wire import (
+from shapespace.service.limits.sandbox_messages import (
     LONGEST_SENTENCE,
+    PIECE,
     Arrays,
+    FailedError,
     JsonObject,
-    describe_arrays,
+    in_a_line,
     receive,
-    receive_exactly,
     send,
 )
+from shapespace.service.refusals import RefusedError
 
 #: A function ``(body, **facts)`` that returns facts and arrays.
 Task = Callable[..., tuple[JsonObject, Arrays]]
+#: A child that uses this many bytes more than at its start answers no further call.
+GROWTH = 128 * 2**20
 
 
-def main() -> None:
+def main(connection: Connection, path: str) -> None:
     """Serve the calls of the parent until the parent ends."""
-    connection = Connection(int(sys.argv[1]))
     # Ctrl-C in a terminal, or a signal to the process group, reaches the children too. Only the parent may end them.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -48,11 +48,13 @@ def main() -> None:
     for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE):
         resource.setrlimit(limit, (0, 0))
     with suppress(Exception):  # the first call raises the error
-        _function(sys.argv[2])
-    send(connection, {"memory": resident_size()})
+        _function(path)
+    before = resident_size()
     with suppress(EOFError, ConnectionError):
         while True:
-            _serve(connection, receive(connection))
+            reply, arrays = _outcome(connection, path)
+            trim_heap()
+            send(connection, reply | {"full": resident_size() - before > GROWTH}, arrays)
 
 
 def _exit_with_parent(connection: Connection) -> None:
@@ -63,31 +65,21 @@ def _exit_with_parent(connection: Connection) -> None:
     os._exit(1)
 
 
-def _serve(connection: Connection, request: Mapping[str, Any]) -> None:
-    bodies = [receive_exactly(connection, request["body"])]
-
-    def run() -> tuple[JsonObject, Arrays]:
-        task = _function(request["task"])
-        with _limited(request["memory"], request["seconds"]):
-            return task(bodies.pop(), **request["facts"])  # no reference stays here, so that the task can free it
-
-    reply, arrays = _outcome(run)
-    trim_heap()
-    parts = (array.reshape(-1).view("u1").data for array in arrays.values())
-    send(connection, reply | {"arrays": describe_arrays(arrays), "memory": resident_size()}, parts)
-
-
-def _outcome(run: Callable[[], tuple[JsonObject, Arrays]]) -> tuple[JsonObject, Arrays]:
-    """Run a task; return the reply and the arrays that follow it."""
+def _outcome(connection: Connection, path: str) -> tuple[JsonObject, Arrays]:
+    """Run the task of the next call; return the reply and its arrays."""
+    request, _ = receive(connection)
+    bodies = [bytearray()]
+    while len(bodies[0]) < request["body"]:
+        bodies[0] += connection.recv_bytes(PIECE)
     try:
-        facts, arrays = run()
-        return {"facts": facts}, {
-            name: array if array.flags.c_contiguous else array.copy() for name, array in arrays.items()
-        }
+        task = _function(path)
+        with _limited(request["memory"]):
+            facts, arrays = task(bodies.pop(), **request["facts"])  # no reference stays, so that the task can free it
+            return {"facts": facts}, arrays
     except MemoryError:
         return {"error": "memory"}, {}
-    except FailedError as error:
-        return {"error": error.kind, "sentence": error.sentence[:LONGEST_SENTENCE]}, {}
+    except RefusedError as error:
+        return {"error": error.kind, "sentence": str(error)[:LONGEST_SENTENCE]}, {}
     except Exception as error:
         return {"error": FailedError.UNEXPECTED, "sentence": in_a_line(error)[:LONGEST_SENTENCE]}, {}
 
@@ -107,22 +99,17 @@ def raise_memory_limit(memory: int) -> None:
 
 
 @contextmanager
-def _limited(memory: int, seconds: int) -> Iterator[None]:
-    """Limit the memory that is mapped in addition to the present memory, and the CPU time."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    limits = {resource.RLIMIT_CPU: math.ceil(usage.ru_utime + usage.ru_stime) + seconds + 1}
+def _limited(memory: int) -> Iterator[None]:
+    """Limit the memory that is mapped in addition to the present memory."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
     if now := mapped_size():
-        limits[resource.RLIMIT_AS] = now + memory
-    before = {limit: resource.getrlimit(limit) for limit in limits}
+        lowest = min(n for n in (now + memory, *before) if n != resource.RLIM_INFINITY)
+        resource.setrlimit(resource.RLIMIT_AS, (lowest, before[1]))
     try:
-        for limit, value in limits.items():
-            lowest = min(n for n in (value, *before[limit]) if n != resource.RLIM_INFINITY)
-            resource.setrlimit(limit, (lowest, before[limit][1]))
         yield
     finally:
-        for limit, pair in before.items():
-            resource.setrlimit(limit, pair)
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 if __name__ == "__main__":
-    main()
+    main(Connection(int(sys.argv[1])), sys.argv[2])

@@ -23,8 +23,9 @@ METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 class Metrics:
     """Metrics of one server, in a registry of their own."""
 
-    def __init__(self, repository: ModelRepository, workers: Workers, connections: Quota) -> None:
-        self.registry = registry = CollectorRegistry()
+    def __init__(
+        self, registry: CollectorRegistry, repository: ModelRepository, workers: Workers, connections: Quota
+    ) -> None:
         ProcessCollector(registry=registry)
         registry.register(_ModelInfo(repository))
 

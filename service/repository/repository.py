@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
 from shapespace.files.limits import in_words
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.process_memory import trim_heap
-from shapespace.service.limits.sandbox_errors import (
+from shapespace.service.limits.sandbox_messages import (
     ClosedError,
     DiedError,
     FailedError,
@@ -23,6 +23,7 @@ from shapespace.service.limits.sandbox_errors import (
     in_a_line,
 )
 from shapespace.service.logs import printable
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.validation import BundleValidator, bundle_folders
 from shapespace.service.versions import DefaultVersions, DefaultVersionsError
 
@@ -30,14 +31,6 @@ logger = logging.getLogger(__name__)
 
 #: State of a folder of bundles: (path, size, time of change, inode) of each file.
 Signature = tuple[tuple[str, int, int, int], ...]
-
-
-class UnknownModelError(LookupError):
-    """No model has this name."""
-
-
-class UnknownVersionError(LookupError):
-    """The model has no such version."""
 
 
 Models = Mapping[str, Mapping[int, ShapeModel]]
@@ -177,18 +170,14 @@ class ModelRepository:
 
     def signature(self) -> Signature:
         """Return the state of the folder and of the file, which changes with any bundle, without reading bundles."""
-        found = []
-        if self._file:
-            with suppress(OSError):
-                status = self._file.stat()
-                found.append((str(self._file), status.st_size, status.st_mtime_ns, status.st_ino))
+        folders: list[Path] = []
         with suppress(OSError):  # the folder is changing; the next check compares again
-            for version in bundle_folders(self._folder)[0]:
-                found.append((str(version), 0, 0, 0))
-                with suppress(OSError), os.scandir(version) as entries:
-                    for entry in entries:
-                        status = entry.stat(follow_symlinks=False)
-                        found.append((entry.path, status.st_size, status.st_mtime_ns, status.st_ino))
+            folders = bundle_folders(self._folder)[0]
+        found = []
+        for path in chain([self._file] if self._file else [], folders, *(folder.glob("*") for folder in folders)):
+            with suppress(OSError):
+                status = path.stat(follow_symlinks=path == self._file)
+                found.append((str(path), status.st_size, status.st_mtime_ns, status.st_ino))
         return tuple(sorted(found))
 
     def __iter__(self) -> Iterator[ShapeModel]:
@@ -204,7 +193,7 @@ class ModelRepository:
         return (model for versions in self._served[0].values() for model in versions.values())
 
     def versions(self, name: str) -> list[str]:
-        """Return the versions of a model, oldest first; raises UnknownModelError."""
+        """Return the versions of a model, oldest first; raises RefusedError, unknown-model."""
         return [str(version) for version in sorted(_named(name, self._served[0]))]
 
     def share(self, model: ShapeModel) -> float:
@@ -218,7 +207,7 @@ class ModelRepository:
         return defaults.divides(name, models.get(name, {}))
 
     def get(self, name: str, version: str | None = None, key: bytes | None = None) -> ShapeModel:
-        """Return a model; raises UnknownModelError or UnknownVersionError.
+        """Return a model; raises RefusedError, unknown-model or unknown-version.
 
         Args:
             name: name of the model.
@@ -233,8 +222,9 @@ class ModelRepository:
             if str(number) == version:
                 return model
         known = ", ".join(map(str, sorted(versions)))
-        raise UnknownVersionError(
-            f"{name} has no version {version!r}. Choose one of {known}, or none for the default version."
+        raise RefusedError(
+            "unknown-version",
+            f"{name} has no version {version!r}. Choose one of {known}, or none for the default version.",
         )
 
     def by_digest(self, prefix: str) -> ShapeModel | None:
@@ -245,7 +235,7 @@ class ModelRepository:
 def _named(name: str, models: Models) -> Mapping[int, ShapeModel]:
     if name not in models:
         known = ", ".join(sorted(models)) or "none at the moment"
-        raise UnknownModelError(f"There is no model {name!r}. /v1/models lists the models: {known}.")
+        raise RefusedError("unknown-model", f"There is no model {name!r}. /v1/models lists the models: {known}.")
     return models[name]
 
 

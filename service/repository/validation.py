@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from pathlib import Path
 
-from shapespace.service.limits.sandbox import Sandbox
-from shapespace.service.limits.sandbox_errors import ClosedError
+from shapespace.service.limits.sandbox import VALIDATE, Sandbox
+from shapespace.service.limits.sandbox_messages import ClosedError
 from shapespace.solve.deadline import Deadline
 
 # Limits on the validation of one bundle. Memory for the solver is added once the size of the mesh is known.
@@ -39,14 +39,14 @@ class BundleValidator:
     """Validates bundles one after the other in the background."""
 
     def __init__(self) -> None:
-        self._sandbox = Sandbox(1)
+        self._sandbox = Sandbox(1, VALIDATE)
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="validation")
         self._digests: dict[Path, Future[str]] = {}
         self._lock, self._closed = threading.Lock(), False
 
     def prepare(self) -> None:
         """Start a process that imports the modules of validation; does not wait for it."""
-        self._sandbox.prepare("validate")
+        self._sandbox.prepare()
 
     def begin(self, folders: Iterable[Path]) -> None:
         """Start to validate bundles that are not validated yet, in this order; does not wait for them."""
@@ -72,7 +72,7 @@ class BundleValidator:
 
     def _validate(self, folder: Path) -> str:
         memory = MEMORY + COPIES * min(_bytes(folder), MOST_FILE_BYTES)
-        facts, _ = self._sandbox.call("validate", {"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
+        facts, _ = self._sandbox.call({"folder": str(folder)}, deadline=Deadline(SECONDS), memory=memory)
         return str(facts["digest"])
 
 

@@ -17,6 +17,7 @@ from shapespace.arrays import FloatArray
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import LatentSpace
 from shapespace.model.memory import FRAMES_PER_RUN, Examples, Fade
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.fields import Body, Number, Whole
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
@@ -28,14 +29,6 @@ ID_LENGTH = 15_000
 ID_BYTES, ID_VALUES = 2**16, 2**13
 #: Bytes of the checksum, the first of SHA-256 of the JSON, and hexadecimal digits of the model's digest.
 CHECKSUM_BYTES, DIGEST_DIGITS = 9, 32
-
-
-class UnknownInterpolationError(LookupError):
-    """No animation has this id on this server."""
-
-
-class PathTooLongError(ValueError):
-    """The keyframes do not fit into an id."""
 
 
 class Animation(Body):
@@ -141,11 +134,12 @@ class Animation(Body):
         """Return an id that holds the whole animation, so that any replica can answer it at any time.
 
         The id is of the animation's canonical form: equal animations of a model have equal ids. Raises LatentError, or
-        PathTooLongError for too many keyframes.
+        RefusedError, path-too-long.
         """
-        too_long = PathTooLongError(
+        too_long = RefusedError(
+            "path-too-long",
             f"{len(self.keyframes)} keyframes of {latents.dimension} numbers don't fit into an "
-            "interpolation's address. Send fewer keyframes, or the parts of the path one by one."
+            "interpolation's address. Send fewer keyframes, or the parts of the path one by one.",
         )
         if len(self.keyframes) + sum(map(len, self.keyframes)) > ID_VALUES:
             raise too_long  # before computing anything from them
@@ -163,7 +157,7 @@ class Animation(Body):
 
     @classmethod
     def from_id(cls, name: str) -> tuple[Animation, str]:
-        """Return the animation of an id, and how its model's digest begins; raises UnknownInterpolationError."""
+        """Return the animation of an id, and how its model's digest begins; raises RefusedError."""
         try:
             if len(name) > ID_LENGTH:
                 raise ValueError
@@ -185,9 +179,10 @@ class Animation(Body):
                 raise ValueError
             return cls.model_validate(content), digest
         except (ValueError, KeyError, AttributeError, TypeError, binascii.Error, zlib.error, ValidationError):
-            raise UnknownInterpolationError(
+            raise RefusedError(
+                "unknown-interpolation",
                 "No interpolation has this id: it is damaged or was not given out by this server. "
-                "POST the keyframes to /v1/models/{name}/interpolations for a new one."
+                "POST the keyframes to /v1/models/{name}/interpolations for a new one.",
             ) from None
 
 

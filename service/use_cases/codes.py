@@ -16,7 +16,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, SearchOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.limits.sandbox import Pieces, Sandbox
-from shapespace.service.limits.sandbox_errors import (
+from shapespace.service.limits.sandbox_messages import (
     ClosedError,
     FailedError,
     LateError,
@@ -24,10 +24,12 @@ from shapespace.service.limits.sandbox_errors import (
     OutOfMemoryError,
     SandboxError,
 )
-from shapespace.service.limits.workers import BusyError, Call, Caller, DeadlineError, EndingError, Workers
-from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.limits.workers import Call, Caller
+from shapespace.service.refusals import RefusedError
+from shapespace.service.tracing import record_stages
+from shapespace.service.use_cases.batch import EncodedFile, Timings, require_count
 from shapespace.service.use_cases.shape_formats import dump_json, float32
-from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_ERRORS, UnusableMeshError, UploadedMesh
+from shapespace.service.use_cases.uploads import TOGETHER, UPLOAD_KINDS, UploadedMesh
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
 
@@ -47,19 +49,6 @@ _SMALLER = f"Fit fewer points or a coarser scan. {_LATER}"
 
 #: Members of an answer, and the time by stage.
 Answered = tuple[dict[str, Any], Timings]
-
-
-@dataclass(frozen=True)
-class Found:
-    """Result of a search.
-
-    Attributes:
-        content: answer as JSON.
-        seconds: time by stage.
-    """
-
-    content: bytes
-    seconds: Timings
 
 
 @dataclass(frozen=True)
@@ -84,23 +73,20 @@ Asked = Callable[[Mapping[str, str]], tuple[ShapeModel, K]]
 
 
 async def encode(
-    workers: Workers,
-    sandbox: Sandbox,
     caller: Caller,
+    sandbox: Sandbox,
     asked: Asked[EncodeOptions],
     upload: Upload,
     most: int,
-) -> Found:
+) -> EncodedFile:
     """Find the code of an uploaded mesh in correspondence, with at most ``most`` samples; see ShapeModel.encode.
 
     An archive may hold up to ``most`` meshes. The answer then has the code of each, with the name of its file.
 
     Raises:
-        UploadError, InvalidMeshError: the mesh can't be used.
+        RefusedError, InvalidMeshError: the mesh can't be used, or there are more than ``most`` samples.
         LatentError: numbers overflow, the code lies outside the bounds where that is refused, or a fixed coordinate
             does not exist.
-        TooManyCodesError: more than ``most`` samples.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
     """
 
     def checked(fields: Mapping[str, str]) -> tuple[ShapeModel, EncodeOptions]:
@@ -111,23 +97,23 @@ async def encode(
 
     model, _ = checked({})  # refused before the file is read
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        meshes, fields = read_upload(sandbox, upload, limits(model.decoder), deadline, most=most)
+        meshes, fields = read_upload(sandbox, upload, limits(model.decoder), call, most=most)
         chosen, options = checked(fields)
         read = time.perf_counter()
         answers = []
         for mesh in meshes:
-            answers.append(_encoded(chosen, mesh, options, deadline))
+            answers.append(_encoded(chosen, mesh, options, call))
             if len(meshes) > 1 and answers[-1]["status"] == Status.DEADLINE:
-                raise workers.late(f"Send fewer meshes at once. {_LATER}")
+                raise call.late(f"Send fewer meshes at once. {_LATER}")
         seconds = {"read": read - began, "search": time.perf_counter() - read}
         if len(meshes) == 1:
             return answers[0], seconds
         named = [{"name": mesh.name, **answer} for mesh, answer in zip(meshes, answers, strict=True)]
         return {"meshes": named}, seconds
 
-    return await _searched(workers, caller, _LATER, make)
+    return await _searched(caller, _LATER, make)
 
 
 def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, deadline: Deadline) -> dict[str, Any]:
@@ -156,14 +142,13 @@ def _encoded(model: ShapeModel, mesh: UploadedMesh, options: EncodeOptions, dead
 
 
 async def edit(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latent: Sequence[float],
     targets: Sequence[Target],
     options: EditOptions,
     most: int,
-) -> Found:
+) -> EncodedFile:
     """Find the code from ``latent`` on that brings vertices to targets, with at most ``most`` samples.
 
     See ShapeModel.edit.
@@ -171,8 +156,7 @@ async def edit(
     Raises:
         InvalidTargetError: no such vertex, or too many targets.
         LatentError: a start that can't be used, or no such coordinate.
-        TooManyCodesError: more than ``most`` samples.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
+        RefusedError, too-many-codes: more than ``most`` samples.
     """
     # Refused before the call waits for a worker.
     require_targets(model.decoder, targets, options.mesh)
@@ -180,9 +164,9 @@ async def edit(
     model.latents.code(latent, Bounds.CLAMP)
     model.latents.fixed(options.fixed)
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        found = model.edit(latent, targets, options, deadline=deadline)
+        found = model.edit(latent, targets, options, deadline=call)
         seconds = {"search": time.perf_counter() - began}
         content = {
             "latent": found.code,
@@ -197,38 +181,36 @@ async def edit(
         }
         return content, seconds
 
-    return await _searched(workers, caller, _LATER, make)
+    return await _searched(caller, _LATER, make)
 
 
 async def fit(
-    workers: Workers,
-    sandbox: Sandbox,
     caller: Caller,
+    sandbox: Sandbox,
     asked: Asked[FitOptions],
     upload: Upload,
     progress: Callable[[float], None] | None = None,
-) -> Found:
+) -> EncodedFile:
     """Find the code, placement and size that explain an uploaded scan; see ShapeModel.fit_scan.
 
     ``progress`` is called in the thread that computes.
 
     Raises:
-        UploadError, InvalidScanError: the scan can't be used.
-        BusyError, DeadlineError, DisconnectedError, EndingError: the server is busy, or the call ended early.
+        RefusedError, InvalidScanError: the scan can't be used.
     """
 
-    def make(deadline: Deadline) -> Answered:
+    def make(call: Call) -> Answered:
         began = time.perf_counter()
-        meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, deadline, points=True, memory=SCAN_MEMORY)
+        meshes, fields = read_upload(sandbox, upload, SCAN_LIMITS, call, points=True, memory=SCAN_MEMORY)
         model, options = asked(fields)
         read = time.perf_counter()
-        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=deadline, progress=progress)
+        found = model.fit_scan((meshes[0].vertices, meshes[0].faces), options, deadline=call, progress=progress)
         return found.answer(), {"read": read - began, "search": time.perf_counter() - read}
 
-    return await _searched(workers, caller, _SMALLER, make)
+    return await _searched(caller, _SMALLER, make)
 
 
-async def events(search: Callable[[Callable[[float], None]], Awaitable[Found]]) -> AsyncGenerator[bytes, None]:
+async def events(search: Callable[[Callable[[float], None]], Awaitable[EncodedFile]]) -> AsyncGenerator[bytes, None]:
     """Yield the progress of a search as JSON, and its answer as the last; raises the error of the search."""
     loop = asyncio.get_running_loop()
     waiting = asyncio.Queue[bytes | None]()
@@ -241,24 +223,27 @@ async def events(search: Callable[[Callable[[float], None]], Awaitable[Found]]) 
     try:
         while (event := await waiting.get()) is not None:
             yield event
-        yield (await work).content
+        content = (await work).content
+        assert isinstance(content, bytes)  # noqa: S101 - narrows the type
+        yield content
     finally:
         work.cancel()
 
 
-async def _searched(workers: Workers, caller: Caller, advice: str, make: Callable[[Deadline], Answered]) -> Found:
+async def _searched(caller: Caller, advice: str, make: Callable[[Call], Answered]) -> EncodedFile:
     """Run a search, which answers its best result so far at its deadline; ``advice`` is for one without a result."""
 
-    def search(call: Call) -> Found:
+    def search(call: Call) -> EncodedFile:
         if call.passed:
-            raise workers.late(advice)
+            raise call.late()
         call.searching = True
         content, seconds = make(call)
-        return Found(dump_json(content), seconds)
+        record_stages(seconds)
+        return EncodedFile(dump_json(content), seconds)
 
-    async with workers.admit(replace(caller, long=True), advice) as call:
+    async with replace(caller, long=True).admit(advice) as call:
         try:
-            return await workers.run(search, call)
+            return await call.run(search)
         except asyncio.CancelledError:
             call.call_off()  # nobody reads the answer
             raise
@@ -282,7 +267,7 @@ def read_upload(
     """Read the meshes of an uploaded file, and the fields of the form, in a process of its own.
 
     Args:
-        sandbox: sandbox whose child processes know the task ``read``.
+        sandbox: sandbox with the task READ.
         upload: file; reading empties it.
         limits: limits of the mesh.
         deadline: time limit of the child process.
@@ -291,10 +276,7 @@ def read_upload(
         most: largest number of meshes; only an archive has several.
 
     Raises:
-        UploadError: the mesh can't be used.
-        DeadlineError: the file was not read in time.
-        BusyError: no process is available.
-        EndingError: the server ends.
+        RefusedError: the mesh can't be used, it was not read in time, no process is available, or the server ends.
     """
     facts: dict[str, Any] = {
         "content_type": upload.content_type,
@@ -306,23 +288,23 @@ def read_upload(
     together = limits if most == 1 else TOGETHER
     size = 24 * (together.vertices + together.faces) + _ANSWER
     try:
-        said, arrays = sandbox.call("read", facts, upload.pieces, deadline=deadline, memory=memory, most=size)
+        said, arrays = sandbox.call(facts, upload.pieces, deadline=deadline, memory=memory, most=size)
     except FailedError as error:
-        if error.kind in UPLOAD_ERRORS:
-            raise UPLOAD_ERRORS[error.kind](error.sentence) from None
+        if error.kind in UPLOAD_KINDS:
+            raise RefusedError(error.kind, error.sentence) from None
         logger.error("the reader of an uploaded file crashed: %s", error.sentence)
         raise _unusable("it breaks its reader") from None
     except LateError:
-        raise DeadlineError("The file was not read in time. Send a smaller one.") from None
+        raise RefusedError("deadline-passed", "The file was not read in time. Send a smaller one.") from None
     except NoProcessError as error:
         logger.error("uploads can't be read: %s", error)
-        raise BusyError(
-            "The server can't start a process to read the file. Try again after the time in Retry-After."
+        raise RefusedError(
+            "busy", "The server can't start a process to read the file. Try again after the time in Retry-After."
         ) from None
     except OutOfMemoryError:
         raise _unusable("reading it takes more memory than a mesh of this model needs") from None
     except ClosedError as error:
-        raise EndingError("The server is about to end. Send the file to another one.") from error
+        raise RefusedError("not-ready", "The server is about to end. Send the file to another one.") from error
     except SandboxError as error:
         logger.warning("the process that reads an uploaded file ended: %s", error)
         raise _unusable("it breaks its reader") from None
@@ -331,5 +313,5 @@ def read_upload(
     return meshes, said["fields"]
 
 
-def _unusable(why: str) -> UnusableMeshError:
-    return UnusableMeshError(f"The mesh can't be used: {why}. Send a plain file of one mesh.")
+def _unusable(why: str) -> RefusedError:
+    return RefusedError("invalid-mesh", f"The mesh can't be used: {why}. Send a plain file of one mesh.")

@@ -6,9 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
+from python_multipart.multipart import MultipartParser, MultipartState, parse_options_header
 
 from shapespace.files.limits import as_utf8, label
+from shapespace.service.refusals import RefusedError
 
 #: Name of the field that holds options as JSON.
 OPTIONS = "options"
@@ -16,18 +17,6 @@ OPTIONS = "options"
 LONGEST_HEADER = 1000
 #: Most fields of a form beside the file, and most bytes of them together.
 _MOST_FIELDS, _LONGEST_FIELDS = 16, 2**18
-
-
-class UploadError(ValueError):
-    """An upload that can't be used. The message says what is wrong and what to do."""
-
-
-class UnreadableFormError(UploadError):
-    """The form breaks the rules of its format, or holds more than one file."""
-
-
-class FormFieldError(UploadError):
-    """The form has a field that the call doesn't have, or a field twice."""
 
 
 @dataclass
@@ -60,7 +49,7 @@ def read_form(
         known: names of the fields that the call has, beside ``options``; None accepts all.
 
     Raises:
-        UploadError: the form can't be read, or holds several files, or a field that the call doesn't have.
+        RefusedError: the form can't be read, or holds several files, or a field that the call doesn't have.
     """
     parts = _Parser(body, boundary).parts
     files = [part for part in parts if part.file_name is not None and part.name != OPTIONS]
@@ -75,9 +64,11 @@ def read_form(
             continue
         if known is not None and part.name not in (*known, OPTIONS):
             there = ", ".join((*known, OPTIONS))
-            raise FormFieldError(f"There is no field {label(part.name) or ''!r} here: choose among {there}.")
+            raise RefusedError(
+                "invalid-request", f"There is no field {label(part.name) or ''!r} here: choose among {there}."
+            )
         if part.name in fields:
-            raise FormFieldError(f"The form has the field {part.name!r} twice. Send it once.")
+            raise RefusedError("invalid-request", f"The form has the field {part.name!r} twice. Send it once.")
         fields[part.name] = _text(part)
     return file, fields
 
@@ -86,11 +77,13 @@ def _text(part: FormPart) -> str:
     try:
         return str(as_utf8(part.data), "utf-8")
     except ValueError:
-        raise FormFieldError(f"The field {part.name!r} is not text in UTF-8. Send it in UTF-8.") from None
+        raise RefusedError(
+            "invalid-request", f"The field {part.name!r} is not text in UTF-8. Send it in UTF-8."
+        ) from None
 
 
-def _unreadable(why: str, remedy: str = "Send one file in it.") -> UnreadableFormError:
-    return UnreadableFormError(f"The form can't be read: {why} {remedy}")
+def _unreadable(why: str, remedy: str = "Send one file in it.") -> RefusedError:
+    return RefusedError("malformed-request", f"The form can't be read: {why} {remedy}")
 
 
 class _Parser:
@@ -99,7 +92,6 @@ class _Parser:
     def __init__(self, body: bytes | bytearray, boundary: bytes | None) -> None:
         self.parts: list[FormPart] = []
         self._body, self._start, self._stop, self._short = memoryview(body), 0, 0, 0
-        self._ended = False
         self._headers: dict[bytes, bytes] = {}
         self._header = b""
         if boundary is None:
@@ -116,18 +108,14 @@ class _Parser:
                     "on_headers_finished": self._on_headers_finished,
                     "on_part_data": self._on_part_data,
                     "on_part_end": self._on_part_end,
-                    "on_end": self._on_end,
                 },
             )
             # In one call, so that positions are positions in the body.
             parser.write(body)  # type: ignore[arg-type]
         except FormParserError:
             raise _unreadable("Invalid multipart data.") from None
-        if not self._ended:
+        if parser.state != MultipartState.END:
             raise _unreadable("It ends before its last boundary.", "Send all of it.")
-
-    def _on_end(self) -> None:
-        self._ended = True
 
     def _on_header_field(self, data: bytes, start: int, stop: int) -> None:
         self._header = bytes(data[start : min(stop, start + LONGEST_HEADER)]).lower()
@@ -143,10 +131,8 @@ class _Parser:
             raise _unreadable(f"Too many fields. Maximum number of fields is {_MOST_FIELDS}.")
         media_type, _ = parse_options_header(self._headers.get(b"content-type"))
         file = options.get(b"filename")
-        name, file_name = (
-            options[b"name"].decode(errors="replace"),
-            None if file is None else file.decode(errors="replace"),
-        )
+        name = options[b"name"].decode(errors="replace")
+        file_name = None if file is None else file.decode(errors="replace")
         self.parts.append(FormPart(name, file_name, media_type.decode("latin-1"), self._body[:0]))
         self._start, self._stop = 0, 0
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -21,14 +20,14 @@ from shapespace.model.decoder import MeshChoice
 from shapespace.model.exact_shapes import ExactShape, exact_shape, require_tangent_space
 from shapespace.model.latent_space import Bounds, Codes
 from shapespace.model.memory import Examples
-from shapespace.model.shape import Diagnostics, Quality, Shape
+from shapespace.model.shape import Diagnostics, Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import Call, Caller, Workers
+from shapespace.service.limits.workers import Call, Caller
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.batch import (
     Batch,
     EncodedFile,
     Timings,
-    TooManyCodesError,
     batch,
     solve,
     solve_all,
@@ -43,7 +42,6 @@ from shapespace.service.use_cases.shape_formats import (
     json_pieces,
     summarise,
 )
-from shapespace.solve.deadline import Deadline
 
 #: Most vertices of all shapes of one answer together: 48 MiB of positions.
 MOST_VERTICES = 2**22
@@ -67,7 +65,6 @@ class ShapeBatch:
 
 
 async def vertices_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: Sequence[Sequence[float]],
@@ -87,13 +84,13 @@ async def vertices_file(
     Raises:
         NoTangentSpaceError: the model has no exponentials.
         LatentError: a code is invalid.
-        TooManyCodesError: the shapes exceed the limit of one answer.
+        RefusedError, too-many-codes: the shapes exceed the limit of one answer.
     """
     if exponentials:
         require_tangent_space(model.decoder)
     codes, inside = model.latents.codes(latents, bounds)
     caller = replace(caller, long=exponentials)
-    async with batch(workers, caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
+    async with batch(caller, shapes_size(model, (2 if exponentials else 1) * len(codes), mesh)) as work:
         found = await shapes(work, model, codes, inside, mesh, quality)
         true = await _exponentials(work, model, codes, found, mesh) if exponentials else None
         if place:
@@ -125,7 +122,6 @@ WriteOutputs = Callable[[Mapping[str, NDArray[np.float32]]], tuple[Iterator[Buff
 
 
 async def infer(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: NDArray[np.floating],
@@ -141,11 +137,12 @@ async def infer(
         shapes_size(model, len(codes), mesh) if name == "vertices" else nric_size(model, len(codes)) for name in outputs
     )
     if size > BYTES_PER_VERTEX * MOST_VERTICES:
-        raise TooManyCodesError(
-            f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes."
+        raise RefusedError(
+            "too-many-codes",
+            f"{len(codes)} codes are too many for both outputs. Ask for one output, or send fewer codes.",
         )
     caller = replace(caller, long=len(codes) > SHORT_INFERENCE)
-    async with batch(workers, caller, size) as work:
+    async with batch(caller, size) as work:
         arrays: dict[str, NDArray[np.float32]] = {}
         found: ShapeBatch | None = None
         for name in outputs:
@@ -166,12 +163,13 @@ def most_inferred(model: ShapeModel) -> int:
 
 
 def shapes_size(model: ShapeModel, count: int, mesh: MeshChoice) -> int:
-    """Return the size of several shapes in bytes; raises TooManyCodesError above the limit of one answer."""
+    """Return the size of several shapes in bytes; raises RefusedError above the limit of one answer."""
     vertices = len(model.mesh(mesh).vertices)
     if count * vertices > MOST_VERTICES:
-        raise TooManyCodesError(
+        raise RefusedError(
+            "too-many-codes",
             f"{count} shapes of {vertices} vertices are too many for one answer. Ask for {MOST_VERTICES // vertices} "
-            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one."
+            "at most, for the coarse mesh, or for an animation's frames as JSON lines or one by one.",
         )
     return BYTES_PER_VERTEX * count * vertices
 
@@ -197,7 +195,7 @@ async def shapes(
     def find(some: slice, call: Call) -> list[tuple[Diagnostics, Timings]]:
         found = []
         own = examples if isinstance(examples, bool) else examples[some]
-        solved = solve_all(work.workers, model, mesh, quality, (codes[some], inside[some]), call, own)
+        solved = solve_all(call, model, mesh, quality, (codes[some], inside[some]), own)
         for k, shape in enumerate(solved, some.start):
             vertices[k] = shape.vertices
             found.append((shape.diagnostics, shape.seconds))
@@ -221,36 +219,30 @@ async def _exponentials(
     return await work.map(one, zip(codes, found.vertices, strict=True))
 
 
-async def blend_shapes_file(
-    workers: Workers, caller: Caller, model: ShapeModel, mesh: MeshChoice
-) -> tuple[bytes, Timings]:
-    """Return a GLB with a morph target for each bound of each coordinate, and its time by stage.
+async def blend_shapes_file(caller: Caller, model: ShapeModel, mesh: MeshChoice) -> EncodedFile:
+    """Return a GLB with a morph target for each bound of each coordinate.
 
     Raises:
         PeriodicError: a coordinate is periodic, so that it has no bounds.
-        TooManyCodesError: all targets together have more vertices than one answer may hold.
+        RefusedError, too-many-codes: all targets together have more vertices than one answer may hold.
         NotFiniteError, ModelFailedError: the model has no shape at a bound.
     """
     require_ends(model.decoder)
     size = shapes_size(model, 2 * model.latents.dimension + 1, mesh)
 
-    def shape(deadline: Deadline, code: Codes) -> Shape:
-        return solve(workers, model, mesh, Quality.FULL, (code, True), deadline)
-
-    def make(deadline: Deadline) -> tuple[bytes, Timings]:
+    def make(call: Call) -> EncodedFile:
         began = time.perf_counter()
-        found = blend_shapes(model.decoder, mesh, partial(shape, deadline))
+        found = blend_shapes(model.decoder, mesh, lambda code: solve(call, model, mesh, Quality.FULL, (code, True)))
         solved = time.perf_counter()
         content = found.glb()
-        return content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved}
+        return EncodedFile(content, {"reconstruct": solved - began, "encode": time.perf_counter() - solved})
 
-    with workers.holding(caller, size):
-        async with workers.admit(replace(caller, long=True)) as call:
-            return await workers.run(make, call)
+    with caller.holding(size):
+        async with replace(caller, long=True).admit() as call:
+            return await call.run(make)
 
 
 async def nric_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     latents: Sequence[Sequence[float]],
@@ -260,10 +252,10 @@ async def nric_file(
 ) -> EncodedFile:
     """Return lengths and angles as the networks predict them, as JSON, on request also those of each factor.
 
-    Raises LatentError, and TooManyCodesError if they exceed the limit of one answer.
+    Raises LatentError, and RefusedError if they exceed the limit of one answer.
     """
     codes, _ = model.latents.codes(latents, bounds)
-    async with batch(workers, caller, nric_size(model, len(codes), factors=factors)) as work:
+    async with batch(caller, nric_size(model, len(codes), factors=factors)) as work:
         began = time.perf_counter()
         found, parts = await predictions(work, model, codes, factors=factors)
         seconds = {"network": time.perf_counter() - began}
@@ -279,11 +271,11 @@ async def nric_file(
 
 
 def nric_size(model: ShapeModel, count: int, *, factors: bool = False) -> int:
-    """Return the size of predictions in bytes; raises TooManyCodesError above the limit of one answer."""
+    """Return the size of predictions in bytes; raises RefusedError above the limit of one answer."""
     size = 8 * model.manifest.edges * (1 + (len(model.manifest.factors) if factors else 0))
     if count * size > MOST_NRIC_BYTES:
-        raise TooManyCodesError(
-            f"{count} codes are too many for one answer. Ask for {MOST_NRIC_BYTES // size} at most."
+        raise RefusedError(
+            "too-many-codes", f"{count} codes are too many for one answer. Ask for {MOST_NRIC_BYTES // size} at most."
         )
     return count * size
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +15,13 @@ from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.memory import Examples
-from shapespace.model.shape import Diagnostics, Quality, Shape
+from shapespace.model.shape import Quality, Shape
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import vertex_uncertainty
-from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.limits.workers import Call, Caller
 from shapespace.service.tracing import record_stages
-from shapespace.service.use_cases.batch import Timings, solve, total_seconds
+from shapespace.service.use_cases.batch import EncodedFile, solve, total_seconds
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, catch_write_errors, with_topology
-from shapespace.solve.deadline import Deadline
 
 
 @dataclass(frozen=True)
@@ -54,16 +51,6 @@ class ShapeRequest:
     examples: Examples = True
 
 
-@dataclass(frozen=True)
-class ShapeFile:
-    """A shape as a file, with the legend of its colours, if there are any, and its time by stage."""
-
-    content: bytes
-    diagnostics: Diagnostics
-    legend: Mapping[str, Any] | None
-    seconds: Timings
-
-
 def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> FloatArray:
     """Return positions (…, V, 3) after a placement; raises NotFiniteError if they overflow."""
     there = vertices.astype(np.float64, copy=False)
@@ -76,22 +63,25 @@ def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> F
     return moved
 
 
-async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> ShapeFile:
-    """Return one shape as a file; raises NotFiniteError or ModelFailedError if the model has none for the code."""
+async def shape_file(caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> EncodedFile:
+    """Return one shape as a file; the legend of its colours, if there are any, is the file's ``facts``.
+
+    Raises NotFiniteError or ModelFailedError if the model has no shape for the code.
+    """
     mesh, colour_by = wanted.mesh, wanted.colour_by
 
-    def find(code: CheckedCode | None, deadline: Deadline, examples: Examples) -> Shape:
+    def find(call: Call, code: CheckedCode | None, examples: Examples) -> Shape:
         if code is None:
             return model.decoder.reference_shape(mesh)
-        return solve(workers, model, mesh, wanted.quality, code, deadline, examples)
+        return solve(call, model, mesh, wanted.quality, code, examples)
 
-    def make(deadline: Deadline) -> ShapeFile:
-        found, colouring = [find(wanted.code, deadline, wanted.examples)], None
+    def make(call: Call) -> EncodedFile:
+        found, colouring = [find(call, wanted.code, wanted.examples)], None
         if colour_by and wanted.code and colour_by.covariance is not None:
-            spread = vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, deadline)
+            spread = vertex_uncertainty(model.decoder, wanted.code[0], colour_by.covariance, mesh, call)
             colouring = Colouring.of_spread(spread)
         elif colour_by:
-            found.append(find(colour_by.against, deadline, bool(wanted.examples)))
+            found.append(find(call, colour_by.against, bool(wanted.examples)))
         began = time.perf_counter()
         if colour_by and colouring is None:
             vertices, against = (shape.vertices for shape in found)
@@ -103,7 +93,7 @@ async def shape_file(workers: Workers, caller: Caller, model: ShapeModel, wanted
         encoding = {"encode": time.perf_counter() - began}
         record_stages(encoding)
         seconds = total_seconds(shape.seconds for shape in found) | encoding
-        return ShapeFile(content, found[0].diagnostics, colouring.legend if colouring else None, seconds)
+        return EncodedFile(content, seconds, asdict(found[0].diagnostics), colouring.legend if colouring else {})
 
-    async with workers.admit(caller) as call:
-        return await workers.run(make, call)
+    async with caller.admit() as call:
+        return await call.run(make)

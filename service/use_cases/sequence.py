@@ -19,27 +19,19 @@ from shapespace.model.latent_space import CheckedCode, NotFiniteError
 from shapespace.model.memory import Examples, Fade
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.limits.workers import Call, Caller, in_parallel
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.repository import ModelRepository
-from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
+from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.batch import EncodedFile, batch, solve_all
 from shapespace.service.use_cases.many_shapes import shapes, shapes_size
 from shapespace.service.use_cases.one_shape import ColourOptions
 from shapespace.service.use_cases.sequence_formats import Frames, encode_frames, json_line
 from shapespace.service.use_cases.shape_formats import summarise, with_topology
-from shapespace.solve.deadline import Deadline
-
-
-class TooManyFramesError(ValueError):
-    """An animation has more frames than the server answers."""
-
-
-class UnknownFrameError(LookupError):
-    """An animation does not have this frame."""
 
 
 def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) -> str:
-    """Return an id that holds an animation; raises TooManyFramesError, LatentError or PathTooLongError."""
+    """Return an id that holds an animation; raises RefusedError or LatentError."""
     _require_frames(animation, most_frames)
     id = animation.to_id(model.digest, model.latents)
     try:
@@ -53,22 +45,23 @@ def interpolation_id(model: ShapeModel, animation: Animation, most_frames: int) 
 
 
 def find_interpolation(repository: ModelRepository, id: str, most_frames: int) -> tuple[Animation, ShapeModel]:
-    """Return the animation of an id, and its model; raises UnknownInterpolationError or TooManyFramesError."""
+    """Return the animation of an id, and its model; raises RefusedError."""
     animation, digest = Animation.from_id(id)
     _require_frames(animation, most_frames)
     model = repository.by_digest(digest)
     if model is None:
-        raise UnknownInterpolationError(
+        raise RefusedError(
+            "unknown-interpolation",
             "The model of this interpolation is not served here any more. POST the keyframes to the "
-            "interpolations of a model that /v1/models lists."
+            "interpolations of a model that /v1/models lists.",
         )
     return animation, model
 
 
 def frame_code(model: ShapeModel, animation: Animation, k: int) -> CheckedCode:
-    """Return the code of one frame; raises UnknownFrameError."""
+    """Return the code of one frame; raises RefusedError, unknown-frame."""
     if not 0 <= k < animation.frame_count:
-        raise UnknownFrameError(f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
+        raise RefusedError("unknown-frame", f"There is no frame {k}. Choose one from 0 to {animation.frame_count - 1}.")
     return model.latents.code(animation.codes(model.latents, slice(k, k + 1))[0])
 
 
@@ -80,7 +73,6 @@ def frame_memory(model: ShapeModel, animation: Animation, k: int) -> Examples:
 
 
 async def sequence_file(
-    workers: Workers,
     caller: Caller,
     model: ShapeModel,
     animation: Animation,
@@ -90,7 +82,7 @@ async def sequence_file(
     fps: float = FRAMES_PER_SECOND,
     colour_by: ColourOptions | None = None,
 ) -> EncodedFile:
-    """Return all frames as one file in a format of SEQUENCE_FORMATS; raises TooManyCodesError or NoRoomError."""
+    """Return all frames as one file in a format of SEQUENCE_FORMATS; raises RefusedError."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
     memory = animation.memory(model.latents)
     number, mesh = len(codes), animation.mesh
@@ -100,7 +92,7 @@ async def sequence_file(
         memory = memory.followed_by(code) if isinstance(memory, Fade) else memory
     # Colours take as much memory as positions.
     caller = replace(caller, long=True)
-    async with batch(workers, caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
+    async with batch(caller, shapes_size(model, len(codes) * (2 if colour_by else 1), mesh)) as work:
         # A frame has the same bytes alone and in the whole animation.
         found = await shapes(work, model, codes, inside, mesh, quality, apart=True, examples=memory)
         vertices, whole = found.vertices[:number], model.mesh(mesh)
@@ -122,17 +114,17 @@ async def sequence_file(
 
 
 async def sequence_lines(
-    workers: Workers, caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
+    caller: Caller, model: ShapeModel, animation: Animation, quality: Quality
 ) -> AsyncGenerator[bytes, None]:
-    """Yield each frame as a line of JSON as soon as it is ready; raises BusyError and as ``Workers.run``."""
+    """Yield each frame as a line of JSON as soon as it is ready; raises RefusedError and as ``Call.run``."""
     codes, inside = model.latents.codes(animation.codes(model.latents))
     faces, memory = model.mesh(animation.mesh).faces, animation.memory(model.latents)
 
-    def lines(some: slice, deadline: Deadline) -> tuple[list[bytes], Exception | None]:
+    def lines(some: slice, call: Call) -> tuple[list[bytes], Exception | None]:
         """Return the lines of some frames; with an error only the lines before it."""
         found: list[bytes] = []
         own = memory[some] if isinstance(memory, Fade) else memory
-        solved = solve_all(workers, model, animation.mesh, quality, (codes[some], inside[some]), deadline, own)
+        solved = solve_all(call, model, animation.mesh, quality, (codes[some], inside[some]), own)
         times = animation.positions[some].tolist()
         try:
             for k, t, shape in zip(count(some.start), times, solved, strict=False):
@@ -143,17 +135,17 @@ async def sequence_lines(
 
     # Each run of frames has its own deadline, because a stream may take as long as its reader takes.
     caller = replace(caller, long=True)
-    with workers.stream(caller):
+    with caller.stream():
         # The first frame is computed alone, so that nobody waits for the others.
         first = slice(0, 1)
         runs = model.decoder.frames(codes, quality, memory)
         rest = (slice(max(run.start, 1), run.stop) for run in runs if run.stop > 1)
-        ready, error = await workers.piece(partial(lines, first), caller)
+        ready, error = await caller.run(partial(lines, first))
         for line in ready:
             yield line
         if error:
             raise error
-        async with aclosing(workers.map(lines, rest, caller)) as batches:
+        async with aclosing(in_parallel(caller, lines, rest)) as batches:
             async for ready, error in batches:
                 for line in ready:
                     yield line
@@ -163,7 +155,8 @@ async def sequence_lines(
 
 def _require_frames(animation: Animation, most: int) -> None:
     if animation.frames > most:
-        raise TooManyFramesError(
+        raise RefusedError(
+            "too-many-frames",
             f"frames is {animation.frames}; the limit is {most}. Ask for fewer frames, or for parts of the path with "
-            "start and stop."
+            "start and stop.",
         )

@@ -18,6 +18,7 @@ from shapespace.files.vtk_writing import vtk_installed
 from shapespace.mesh.attributes import MeshAttributes, Topology
 from shapespace.model.exact_shapes import ExactShape
 from shapespace.model.shape import Diagnostics, Quality
+from shapespace.service.refusals import RefusedError
 
 #: Bytes in which values are counted at once; counting ends after the piece in which they exceed the limit.
 _PIECE = 2**16
@@ -71,19 +72,16 @@ UNAVAILABLE = dict.fromkeys(
 )
 
 
-class NoRoomError(OSError):
-    """There is no room for a temporary file."""
-
-
 @contextmanager
 def catch_write_errors() -> Iterator[None]:
-    """Raise NoRoomError if USD cannot write its temporary file."""
+    """Raise RefusedError if USD cannot write its temporary file."""
     try:
         yield
     except OSError:
-        raise NoRoomError(
+        raise RefusedError(
+            "no-room",
             "The server has no room for the temporary file of USD. Ask for another format, or set TMPDIR of the "
-            "server to a writable folder."
+            "server to a writable folder.",
         ) from None
 
 

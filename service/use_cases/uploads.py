@@ -22,13 +22,10 @@ from shapespace.files.limits import Limits, clipped, label, reason
 from shapespace.files.reading import OCTET_STREAM, READ_FORMATS, SCAN_FORMATS, read_arrays
 from shapespace.files.recognition import Assumed, FormatError, decide
 from shapespace.mesh.triangle_mesh import MeshError
-from shapespace.service.limits.sandbox_errors import FailedError
-from shapespace.service.limits.sandbox_wire import Arrays, JsonObject
+from shapespace.service.limits.sandbox_messages import Arrays, JsonObject
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.forms import (
     LONGEST_HEADER,
-    FormFieldError,
-    UnreadableFormError,
-    UploadError,
     read_form,
 )
 from shapespace.service.use_cases.json_names import repeated_member
@@ -55,18 +52,8 @@ _GIVEN = "?format="
 TOGETHER = Limits(2**21, 2**21)
 
 
-class UnusableMeshError(UploadError):
-    """There is no file, or it holds no mesh within the limits."""
-
-
-class UnknownFormatError(UploadError):
-    """The file has an unknown format, or one that is not read."""
-
-
-#: Classes of errors by name. A sandbox process sends the name.
-UPLOAD_ERRORS = {
-    error.__name__: error for error in (UnusableMeshError, UnreadableFormError, FormFieldError, UnknownFormatError)
-}
+#: Kinds of problems of uploads, which a sandbox process names.
+UPLOAD_KINDS = ("invalid-mesh", "malformed-request", "invalid-request", "unsupported-media-type")
 
 
 class UploadedMesh(NamedTuple):
@@ -104,7 +91,7 @@ def read_mesh_files(
         The meshes, and the fields of the form.
 
     Raises:
-        UploadError: there is no file, the form or the file can't be read, or the format is unknown.
+        RefusedError: there is no file, the form or the file can't be read, or the format is unknown.
     """
     name, fields, formats = "", dict[str, str](), POINT_FORMATS if points else FORMATS
     declared, options = parse_options_header(content_type[:LONGEST_HEADER])
@@ -112,12 +99,13 @@ def read_mesh_files(
     if declared == b"multipart/form-data":
         file, fields = read_form(body, options.get(b"boundary"), known)
         if file is None:
-            raise UnusableMeshError(
-                "The form has no file. Send the mesh file as a field with a file name: -F file=@mesh.obj"
+            raise RefusedError(
+                "invalid-mesh",
+                "The form has no file. Send the mesh file as a field with a file name: -F file=@mesh.obj",
             )
         data, name, media_type = file.data, file.file_name or "", file.media_type
     if not data:
-        raise UnusableMeshError("The file is empty. Send a mesh file as the body, or as a file in a form.")
+        raise RefusedError("invalid-mesh", "The file is empty. Send a mesh file as the body, or as a file in a form.")
     accepted = ", ".join((*formats, ARCHIVE))
     try:
         found = _format(data, (*formats, ARCHIVE), fields.get("format") or format, name, media_type)
@@ -125,16 +113,17 @@ def read_mesh_files(
         sentence = (
             f"The file {str(error).rstrip('.')}. Send one of {accepted}. If it is one of these, name it with ?format=."
         )
-        raise UnknownFormatError(sentence) from None
+        raise RefusedError("unsupported-media-type", sentence) from None
     try:
         if found.name == ARCHIVE:
             return _read_archive(data, limits, points=points, most=most), fields
         return [_read(data, found.name, limits, points=points)], fields
     except MeshError as error:
         fault = str(error).rstrip(".") + (_looks_otherwise(data, found) if found.because == _GIVEN else "")
-        raise UnusableMeshError(
+        raise RefusedError(
+            "invalid-mesh",
             f"The mesh can't be used: {fault}. The server read it as {found.name}, as {found.because} says. "
-            f"Send a correct {found.name} file. If it has another format, name it with ?format=: {accepted}."
+            f"Send a correct {found.name} file. If it has another format, name it with ?format=: {accepted}.",
         ) from None
 
 
@@ -220,12 +209,9 @@ def read_in_sandbox(
     known: list[str],
     most: int,
 ) -> tuple[JsonObject, Arrays]:
-    """Run `read_mesh_files` as a task of a sandbox; raises FailedError. Equal faces are sent once."""
+    """Run `read_mesh_files` as a task of a sandbox. Equal faces are sent once."""
     limits = Limits(vertices, faces)
-    try:
-        meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
-    except UploadError as error:
-        raise FailedError(type(error).__name__, str(error)) from None
+    meshes, fields = read_mesh_files(body, content_type, format, limits, points=points, known=known, most=most)
     arrays: Arrays = {f"vertices {k}": mesh.vertices for k, mesh in enumerate(meshes)}
     arrays |= {f"faces {k}": m.faces for k, m in enumerate(meshes) if not k or m.faces is not meshes[0].faces}
     return {"fields": fields, "names": [mesh.name for mesh in meshes]}, arrays

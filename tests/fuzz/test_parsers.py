@@ -31,9 +31,9 @@ from shapespace.model.correspondence import InvalidMeshError, Matched, limits, m
 from shapespace.model.latent_space import LatentError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.negotiation import choose
-from shapespace.service.http.problems import ProblemError
-from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
-from shapespace.service.use_cases.uploads import UploadError, read_mesh_files
+from shapespace.service.refusals import RefusedError
+from shapespace.service.use_cases.animation import Animation
+from shapespace.service.use_cases.uploads import read_mesh_files
 from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.ingest import read_collection
 from tests.gltf_documents import BINARY, MATRIX, document, glb
@@ -213,7 +213,7 @@ def test_uploads(format: str) -> None:
             with at_most(1000 + 10 * len(data), MEMORY):
                 ((vertices, faces, _),), _ = read_mesh_files(data, "", format, SMALL)
             found = match(model().decoder, vertices, faces)
-        except (UploadError, InvalidMeshError) as error:
+        except (RefusedError, InvalidMeshError) as error:
             one_line(error)
         else:
             assert found.vertices.shape == MESH.vertices.shape
@@ -245,7 +245,7 @@ def test_forms() -> None:
         with suppress(InvalidMeshError):
             try:
                 matched(data, None, content_type.decode("latin-1"))
-            except UploadError as error:
+            except RefusedError as error:
                 one_line(error)
 
     upload()
@@ -260,7 +260,7 @@ def test_an_upload_opens_no_other_file(uri: str, tmp_path: Path, monkeypatch: py
     (tmp_path / "shape.bin").write_bytes(data)  # the file that it names exists
     monkeypatch.chdir(tmp_path)
     tree["buffers"][0]["uri"] = uri
-    with pytest.raises(UploadError) as refusal:
+    with pytest.raises(RefusedError) as refusal:
         matched(json.dumps(tree).encode(), "gltf")
     one_line(refusal.value)
     assert "root:" not in str(refusal.value)
@@ -364,7 +364,7 @@ def test_ids_of_interpolations(data: st.DataObject) -> None:
     name = data.draw(damaged(sound_id().encode())).decode("latin-1")
     try:
         animation, _ = Animation.from_id(name)
-    except UnknownInterpolationError as error:
+    except RefusedError as error:
         one_line(error)
     else:
         assert name == sound_id()
@@ -376,7 +376,7 @@ def test_ids_of_interpolations(data: st.DataObject) -> None:
 def test_what_is_accepted(accept: str) -> None:
     try:
         assert choose({"glb": "model/gltf-binary", "obj": "model/obj"}, None, accept) in {"glb", "obj"}
-    except ProblemError as error:
+    except RefusedError as error:
         one_line(error)
 
 

@@ -17,7 +17,7 @@ from shapespace.files.archives import Buffer
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages import bodies
 from shapespace.service.http.messages.open_inference import INPUT, InferenceRequest
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.shape_formats import dump_json
 
 #: Header with the length of the JSON part of a body that continues with bytes.
@@ -31,13 +31,13 @@ def read_request(body: bytes, header: str | None) -> tuple[InferenceRequest, byt
     """Return the request in a body, whose JSON is as long as HEADER says, and the bytes of the input after it.
 
     Raises:
-        ProblemError: the lengths contradict each other.
+        RefusedError: the lengths contradict each other.
         RequestValidationError: the JSON is no valid request.
     """
     length = len(body)
     if header is not None:
         if not re.fullmatch("[0-9]{1,12}", header) or int(header) > length:
-            raise ProblemError(
+            raise RefusedError(
                 "malformed-request",
                 f"{HEADER} is {header!r}, but the body has {length} bytes. Send the length of its JSON part.",
             )
@@ -56,7 +56,7 @@ def read_request(body: bytes, header: str | None) -> tuple[InferenceRequest, byt
 
 
 def read_codes(request: InferenceRequest, tail: bytes) -> NDArray[np.floating]:
-    """Return the codes (n, m) of a request, given the bytes after it; raises ProblemError."""
+    """Return the codes (n, m) of a request, given the bytes after it; raises RefusedError."""
     tensor = request.inputs[0]
     n, m = tensor.shape
     if tensor.data is not None:
@@ -75,8 +75,8 @@ def read_codes(request: InferenceRequest, tail: bytes) -> NDArray[np.floating]:
     return values.reshape(n, m)
 
 
-def _invalid(detail: str) -> ProblemError:
-    return ProblemError("invalid-request", detail + ".")
+def _invalid(detail: str) -> RefusedError:
+    return RefusedError("invalid-request", detail + ".")
 
 
 def write_answer(

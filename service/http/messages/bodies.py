@@ -1,4 +1,4 @@
-"""Bodies of requests.
+"""Bodies of requests, and JSON in queries and forms.
 
 JSON is counted before it is parsed, and a few faults suffice to refuse it. Large bodies are checked in a thread. Files
 are gathered in pieces.
@@ -15,14 +15,15 @@ from typing import Generic, TypeVar
 import orjson
 from fastapi import Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from shapespace.service.http.negotiation import declared_type
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.json_names import repeated_member
 from shapespace.service.use_cases.shape_formats import holds_more_values
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
 #: Maximum number of values in a body, counted by separators; after parsing they take at most 20 MB.
 MOST_VALUES = 2**18
 #: Bodies up to this size in bytes are parsed on the event loop, which is faster than in a thread.
@@ -50,12 +51,12 @@ class JSONBody(Generic[M]):
         """Read the body.
 
         Raises:
-            ProblemError: the body is not declared as JSON, or has too many values.
+            RefusedError: the body is not declared as JSON, or has too many values.
             RequestValidationError: the body is not JSON, or does not match the model.
         """
         declared = declared_type(request.headers)
         if declared != "application/json" and not (declared.startswith("application/") and declared.endswith("+json")):
-            raise ProblemError(
+            raise RefusedError(
                 "unsupported-media-type",
                 f"The body is {request.headers.get('content-type') or 'of no declared type'}. Send JSON, and the "
                 "header Content-Type: application/json with it.",
@@ -78,13 +79,13 @@ def parse(text: bytes) -> object:
     """Parse JSON with a bounded number of values; the model must refuse NaN and infinities. Raises as ``JSONBody``."""
     message = _parse(text)
     if name := repeated_member(text):
-        raise ProblemError("invalid-request", f"The JSON has the member {name!r} twice in one object. Send it once.")
+        raise RefusedError("invalid-request", f"The JSON has the member {name!r} twice in one object. Send it once.")
     return message
 
 
 def _parse(text: bytes) -> object:
     if holds_more_values(text, MOST_VALUES):
-        raise ProblemError(
+        raise RefusedError(
             "body-too-large", f"The body holds more than {MOST_VALUES} values. Send fewer in each request."
         )
     try:
@@ -103,6 +104,17 @@ def _parse(text: bytes) -> object:
     except ValueError:
         where, why = 0, "a number of thousands of digits"
     raise RequestValidationError([{"type": "json_invalid", "loc": ("body", where), "ctx": {"error": why}}])
+
+
+def read_query(text: str, name: str, model: TypeAdapter[T]) -> T:
+    """Return the value of a parameter; raises RequestValidationError, or RefusedError if the text is not JSON."""
+    try:
+        return model.validate_python(parse(text.encode()))
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+        raise RequestValidationError([{**fault, "loc": ("query", name, *fault["loc"])} for fault in faults]) from None
+    except RequestValidationError:
+        raise RefusedError("invalid-request", f"{name} is not JSON. Send one valid JSON value.") from None
 
 
 async def gather(request: Request) -> deque[memoryview]:

@@ -20,9 +20,9 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.vertex_uncertainty import require_covariance
 from shapespace.service.http.dependencies import Format, one_of
-from shapespace.service.http.messages.json_query import read_query
+from shapespace.service.http.messages.bodies import read_query
 from shapespace.service.http.negotiation import choose, listed
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.fields import Body, Number
 from shapespace.service.use_cases.one_shape import ColourOptions, ShapeRequest
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS, UNAVAILABLE, writable
@@ -40,14 +40,14 @@ _UNCOLOURED = {
 
 
 def numbers(parts: Sequence[str], name: str) -> list[float]:
-    """Read a code from a query; raises ProblemError, invalid-request."""
+    """Read a code from a query; raises RefusedError, invalid-request."""
     text = ",".join(parts)
     try:
         if "_" in text or not text.isascii():  # Python accepts more spellings of numbers than other languages
             raise ValueError
         return [float(part) for part in text.split(",")] if text else []
     except ValueError:
-        raise ProblemError(
+        raise RefusedError(
             "invalid-request", f"{name} is not a list of numbers. Send them separated by commas: ?{name}=0.1,0.2"
         ) from None
 
@@ -62,16 +62,16 @@ class ColourParameters:
     def on(
         self, model: ShapeModel, bounds: Bounds = Bounds.ALLOW, covariance: Sequence[Sequence[float]] | None = None
     ) -> ColourOptions | None:
-        """Return the colouring, with the other code checked like the first; raises LatentError or ProblemError."""
+        """Return the colouring, with the other code checked like the first; raises LatentError or RefusedError."""
         if self.quantity is Quantity.SPREAD:
             if covariance is None:
-                raise ProblemError(
+                raise RefusedError(
                     "invalid-request",
                     "color=spread needs the covariance of the code. POST the code and its covariance in the body.",
                 )
             return ColourOptions(self.quantity, None, require_covariance(model.decoder, covariance))
         if covariance is not None:
-            raise ProblemError(
+            raise RefusedError(
                 "invalid-request", "covariance is only for color=spread. Add ?color=spread, or leave covariance out."
             )
         if self.quantity is None:
@@ -99,7 +99,7 @@ async def _color(
     ] = None,
 ) -> ColourParameters:
     if against is not None and color in (None, Quantity.SPREAD):
-        raise ProblemError(
+        raise RefusedError(
             "invalid-request",
             "against is only for color=stretch and color=bending. Add one of them, or leave against out.",
         )
@@ -121,16 +121,16 @@ TopologyQuery = Annotated[
 def choose_topology(
     asked: Topology | None, format: str, model: ShapeModel, mesh: MeshChoice, *, polygons: bool
 ) -> Topology:
-    """Return the topology of an answer; raises ProblemError for polygons that are not available."""
+    """Return the topology of an answer; raises RefusedError for polygons that are not available."""
     if asked is Topology.ORIGINAL:
         if not polygons:
-            raise ProblemError(
+            raise RefusedError(
                 "invalid-request",
                 f"{format.upper()} answers have triangles only. "
                 "For topology=original ask for obj, zip, ply, vtk or usd.",
             )
         if model.decoder.fine and not model.decoder.finer(mesh):
-            raise ProblemError(
+            raise RefusedError(
                 "invalid-request", "The coarse mesh has triangles only. For topology=original ask for mesh=fine."
             )
     return asked or Topology.ORIGINAL
@@ -197,7 +197,7 @@ class MeshOptions:
         covariance: Sequence[Sequence[float]] | None = None,
         examples: Examples = True,
     ) -> ShapeRequest:
-        """Return the request for the shape of a code, None for the reference; raises ProblemError or LatentError.
+        """Return the request for the shape of a code, None for the reference; raises RefusedError or LatentError.
 
         ``bounds`` are for the code that colours compare with, and ``covariance`` (m, m) is for ``color=spread``.
         """

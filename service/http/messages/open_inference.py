@@ -7,7 +7,8 @@ https://github.com/open-inference/open-inference-protocol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator
@@ -18,8 +19,7 @@ from shapespace.model.latent_space import Bounds
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.messages.schemas import BoundsField, QualityField
-from shapespace.service.http.problems import ProblemError
-from shapespace.service.operation.statistics import InferenceTally
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.fields import Number, Whole
 
 INPUT = "latent"
@@ -139,9 +139,9 @@ class InferenceRequest(_Message):
             names = [output.get("name") for output in given[: len(OUTPUTS) + 1] if isinstance(output, dict)]
             for name in OUTPUTS:
                 if names.count(name) > 1:
-                    raise ProblemError("malformed-request", f"outputs names {name} twice. Name each output once.")
+                    raise RefusedError("malformed-request", f"outputs names {name} twice. Name each output once.")
             if len(given) > len(OUTPUTS):
-                raise ProblemError("malformed-request", f"outputs has {len(given)} entries. Name each output once.")
+                raise RefusedError("malformed-request", f"outputs has {len(given)} entries. Name each output once.")
         return given
 
     @property
@@ -241,6 +241,11 @@ class InferenceDuration(BaseModel):
     count: int
     ns: int
 
+    def add(self, seconds: float) -> None:
+        """Count one request."""
+        self.count += 1
+        self.ns += round(1e9 * seconds)
+
 
 class InferenceStatistics(BaseModel):
     """Requests by result, and the time of answered requests by stage."""
@@ -263,6 +268,32 @@ class ModelStatistics(BaseModel):
     execution_count: int = Field(description="Requests that were answered.")
     inference_stats: InferenceStatistics
     batch_stats: list[InferenceDuration] = Field(description="Empty: codes of several requests are not joined.")
+
+    @classmethod
+    def of(cls, model: ShapeModel) -> ModelStatistics:
+        """Return the statistics of a model before its first inference."""
+        parts = {part: InferenceDuration(count=0, ns=0) for part in InferenceStatistics.model_fields}
+        return cls(
+            name=model.manifest.name,
+            version=model.manifest.version,
+            last_inference=0,
+            inference_count=0,
+            execution_count=0,
+            inference_stats=InferenceStatistics(**parts),
+            batch_stats=[],
+        )
+
+    def succeed(self, codes: int, seconds: float, stages: Mapping[str, float]) -> None:
+        """Count a request that was answered, with its time, and its time by stage, as in ``Server-Timing``."""
+        self.last_inference = time.time_ns() // 10**6
+        self.inference_count += codes
+        self.execution_count += 1
+        infer, output = stages.get("network", 0.0) + stages.get("reconstruct", 0.0), stages.get("encode", 0.0)
+        self.inference_stats.success.add(seconds)
+        # Shapes that are computed at the same time may take more time together than the request.
+        self.inference_stats.queue.add(max(0.0, seconds - infer - output))
+        self.inference_stats.compute_infer.add(infer)
+        self.inference_stats.compute_output.add(output)
 
 
 class StatisticsAnswer(BaseModel):
@@ -312,23 +343,6 @@ def model_configuration(model: ShapeModel, limits: ModelLimits) -> ModelConfigur
         max_batch_size=limits.max_codes,
         input=inputs,
         output=outputs,
-    )
-
-
-def model_statistics(model: ShapeModel, tally: InferenceTally) -> ModelStatistics:
-    """Return the statistics of a version of a model."""
-    parts = {
-        part: InferenceDuration(count=tally.counts[part], ns=round(1e9 * tally.seconds.get(part, 0.0)))
-        for part in InferenceStatistics.model_fields
-    }
-    return ModelStatistics(
-        name=model.manifest.name,
-        version=model.manifest.version,
-        last_inference=tally.last,
-        inference_count=tally.codes,
-        execution_count=tally.counts["success"],
-        inference_stats=InferenceStatistics(**parts),
-        batch_stats=[],
     )
 
 

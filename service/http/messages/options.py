@@ -14,8 +14,8 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 
 from shapespace.model.options import descriptions
-from shapespace.service.http.messages.json_query import read_query
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.http.messages.bodies import read_query
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.fields import Number, NumbersByIndex, NumberText, Whole, WholeText
 from shapespace.service.use_cases.forms import OPTIONS
 
@@ -77,7 +77,7 @@ def options_with_fields(kind: type[K], query: BaseModel, body: type[BaseModel], 
         fields: fields of the form by name, with those that are no options.
 
     Raises:
-        RequestValidationError, ProblemError: a field has a wrong value, or the form says the same option twice.
+        RequestValidationError, RefusedError: a field has a wrong value, or the form says the same option twice.
     """
     names, text = type(query).model_fields, fields.get(OPTIONS, "")
     given = {name: value for name, value in fields.items() if name in names}
@@ -88,7 +88,7 @@ def options_with_fields(kind: type[K], query: BaseModel, body: type[BaseModel], 
         faults = ({**fault, "loc": ("form", *_place(fault["loc"]))} for fault in error.errors())
         raise RequestValidationError([*faults]) from None
     if twice := [name for name in given for each in sent if name in each.model_fields_set]:
-        raise ProblemError("invalid-request", f"The form has {twice[0]} as a field and in {OPTIONS}. Send it once.")
+        raise RefusedError("invalid-request", f"The form has {twice[0]} as a field and in {OPTIONS}. Send it once.")
     return options_of(kind, query, checked, *sent)
 
 

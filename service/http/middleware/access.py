@@ -7,11 +7,11 @@ import hashlib
 import hmac
 import re
 import time
-from collections import OrderedDict
 from collections.abc import Collection
 from http import HTTPStatus
 from urllib.parse import unquote
 
+from cachetools import LRUCache
 from pydantic import SecretStr
 from starlette.datastructures import Headers
 from starlette.middleware.cors import CORSMiddleware
@@ -59,11 +59,11 @@ class AcceptWholeAddress(HTTPMiddleware):
 
 
 class RequireHost(HTTPMiddleware):
-    """Refuses requests without exactly one ``Host``, and requests for another host.
+    """Refuses requests for another host; h11 refuses those without exactly one ``Host``.
 
     This prevents DNS rebinding: an attacker lets the name of his web site resolve to the visitor's machine, so that
     his page may call a server there. The name in ``Host`` is still the attacker's. ``hosts`` are the accepted names,
-    without ports and in lower case; none accepts all.
+    without ports and in lower case.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str]) -> None:
@@ -72,20 +72,13 @@ class RequireHost(HTTPMiddleware):
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on requests for this server."""
+        given = Headers(scope=scope).get("host")  # HTTP/1.0 has none
         # Orchestrators ask for health by any address they know.
-        if scope["path"] not in HEALTH and (refusal := self._refusal(scope)):
-            await problem(scope, *refusal)(scope, receive, send)
+        if given and scope["path"] not in HEALTH and re.sub(r":[0-9]*$", "", given).lower() not in self._hosts:
+            detail = f"This server isn't called {given!r}. Use one of its names: {', '.join(sorted(self._hosts))}; "
+            await problem(scope, "misdirected", f"{detail}SHAPESPACE_HOSTS adds others.")(scope, receive, send)
         else:
             await self.app(scope, receive, send)
-
-    def _refusal(self, scope: Scope) -> tuple[str, str] | None:
-        given = Headers(scope=scope).getlist("host")
-        if len(given) > 1 or (not given and scope["http_version"] != "1.0"):
-            return "no-host", f"The request has {len(given)} headers Host. Send one."
-        if self._hosts and given and re.sub(r":[0-9]*$", "", given[0]).lower() not in self._hosts:
-            detail = f"This server isn't called {given[0]!r}. Use one of its names"
-            return "misdirected", f"{detail}: {', '.join(sorted(self._hosts))}; SHAPESPACE_HOSTS adds others."
-        return None
 
 
 class RequireKey(HTTPMiddleware):
@@ -99,7 +92,7 @@ class RequireKey(HTTPMiddleware):
         super().__init__(app)
         self._digest = _digest(key.get_secret_value())
         #: Time at which the next wrong key from an address may be answered.
-        self._next: OrderedDict[str, float] = OrderedDict()
+        self._next: LRUCache[str, float] = LRUCache(KEY_ADDRESSES)
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass on requests that have the key or need none."""
@@ -111,15 +104,12 @@ class RequireKey(HTTPMiddleware):
         kind, detail = "unauthorized", "Send the server's API key: Authorization: Bearer KEY, or X-API-Key: KEY."
         if given:
             now, client = time.monotonic(), client_of(scope)
-            turn = max(now, self._next.pop(client, 0.0))
+            turn = max(now, self._next.get(client, 0.0))
             if turn - now > KEY_WAIT:
                 kind, detail = "busy", "Too many wrong keys came from this address. Send the right key."
-                self._next[client] = turn
             else:
                 self._next[client] = turn + KEY_INTERVAL
                 await asyncio.sleep(turn - now)
-            if len(self._next) > KEY_ADDRESSES:
-                self._next.popitem(last=False)
         await problem(scope, kind, detail)(scope, receive, send)
 
 

@@ -8,8 +8,9 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.service.http.middleware.base import HTTPMiddleware, client_of
-from shapespace.service.http.problems import ProblemError, problem
-from shapespace.service.limits.quota import UPLOADS, Quota, QuotaError
+from shapespace.service.http.problems import problem
+from shapespace.service.limits.quota import UPLOADS, Quota
+from shapespace.service.refusals import RefusedError
 
 #: Most bytes of all answers that wait to be read.
 UNREAD_BYTES = 256 * 2**20
@@ -32,7 +33,7 @@ class LimitBody(HTTPMiddleware):
     def __init__(self, app: ASGIApp, limit: int, upload: int) -> None:
         super().__init__(app)
         self._limit, self._upload = limit, upload
-        self._held = Quota(UPLOADS * max(limit, upload))
+        self._held = Quota(UPLOADS * max(limit, upload), "The server holds too many bodies")
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and count its body while it is read."""
@@ -54,17 +55,12 @@ class LimitBody(HTTPMiddleware):
                     "The body has a Content-Encoding that isn't read here. Send it uncompressed, or with gzip "
                     "or deflate."
                 )
-                raise ProblemError("unsupported-media-type", detail)
+                raise RefusedError("unsupported-media-type", detail)
             message = await given()
             size = len(message.get("body", b""))
             if received + size > limit:
                 raise _too_large(limit)
-            try:
-                self._held.take(client, size)
-            except QuotaError:
-                raise ProblemError(
-                    "busy", "The server holds too many bodies. Try again after the time in Retry-After."
-                ) from None
+            self._held.take(client, size)
             received += size
             return message
 
@@ -123,7 +119,7 @@ class LimitUnreadAnswers(HTTPMiddleware):
 
     def __init__(self, app: ASGIApp) -> None:
         super().__init__(app)
-        self._held = Quota(UNREAD_BYTES)
+        self._held = Quota(UNREAD_BYTES, "Too many answers are being read slowly")
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and send its answer in pieces."""
@@ -143,10 +139,9 @@ class LimitUnreadAnswers(HTTPMiddleware):
                 if len(body) > PIECE_BYTES:
                     try:
                         self._held.take(client, len(body))
-                    except QuotaError:
+                    except RefusedError as error:
                         refused = True
-                        detail = "Too many answers are being read slowly. Try again after the time in Retry-After."
-                        await problem(scope, "busy", detail)(scope, receive, send)
+                        await problem(scope, error.kind, str(error))(scope, receive, send)
                         return
                     held = len(body)
                 await send(start)
@@ -163,10 +158,10 @@ class LimitUnreadAnswers(HTTPMiddleware):
             self._held.give_back(client, held)
 
 
-def _damaged() -> ProblemError:
+def _damaged() -> RefusedError:
     detail = "The body isn't compressed as its Content-Encoding says, or it is cut short. Send all of it."
-    return ProblemError("malformed-request", detail)
+    return RefusedError("malformed-request", detail)
 
 
-def _too_large(limit: int) -> ProblemError:
-    return ProblemError("body-too-large", f"The body is over the limit of {limit} bytes. Send less in each request.")
+def _too_large(limit: int) -> RefusedError:
+    return RefusedError("body-too-large", f"The body is over the limit of {limit} bytes. Send less in each request.")

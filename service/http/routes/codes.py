@@ -14,10 +14,10 @@ from pydantic import BaseModel
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.dependencies import (
-    CallerDependency,
-    MeshQuery,
+    Asked,
+    AskedDependency,
+    MeshOfBody,
     Model,
-    Service,
     ServiceDependency,
     note_model,
     one_of,
@@ -37,7 +37,7 @@ from shapespace.service.http.messages.schemas import (
     SampleAnswer,
     SampleRequest,
 )
-from shapespace.service.http.responses import found_response
+from shapespace.service.http.responses import encoded_response
 from shapespace.service.use_cases import codes
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.shape_formats import dump_json
@@ -57,9 +57,8 @@ async def _upload(request: Request, format: str | None) -> codes.Upload:
     return codes.Upload(await gather(request), request.headers.get("content-type", ""), format, known)
 
 
-def _asked(
-    service: Service,
-    request: Request,
+def _options(
+    asked: Asked,
     model: ShapeModel,
     kind: type[K],
     query: BaseModel,
@@ -68,8 +67,8 @@ def _asked(
 ) -> tuple[ShapeModel, K]:
     """Return the model and the options that the query and the fields of a form ask for."""
     if version := fields.get("version"):
-        model = service.repository.get(request.path_params["name"], version)
-        note_model(request, model)
+        model = asked.service.repository.get(asked.request.path_params["name"], version)
+        note_model(asked.request, model)
     return model, options_with_fields(kind, query, body, fields)
 
 
@@ -80,9 +79,7 @@ def _asked(
     openapi_extra=upload("A mesh file."),
 )
 async def encode(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     options: Annotated[EncodeQuery, Query()],
     format: Annotated[str | None, one_of((*FORMATS, ARCHIVE)), _FORMAT] = None,
@@ -93,19 +90,18 @@ async def encode(
     units of the training meshes. A mesh with less than a third or more than three times their size is refused. A ZIP
     archive with several meshes is answered with `{"meshes": […]}`: this answer for each, with the `name` of its file.
     """
-    asked = partial(_asked, service, request, model, EncodeOptions, options, EncodeRequest)
-    file, most = await _upload(request, format), service.settings.max_codes
-    found = await codes.encode(service.workers, service.sandbox, caller, asked, file, most)
-    return found_response(service, found)
+    wanted = partial(_options, asked, model, EncodeOptions, options, EncodeRequest)
+    file, most = await _upload(asked.request, format), asked.service.settings.max_codes
+    found = await codes.encode(asked.caller, asked.service.sandbox, wanted, file, most)
+    return encoded_response(asked.service, found, "application/json")
 
 
 @router.post("/edit", responses=problems(400, 404, 413, 415, 422, 503, 504), response_model=EditAnswer)
 async def edit(
-    service: ServiceDependency,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     body: Annotated[EditRequest, Depends(JSONBody(EditRequest))],
-    mesh: MeshQuery = None,
+    mesh: MeshOfBody = None,
 ) -> Response:
     """Find the code inside the bounds whose shape comes closest to having some vertices at given positions.
 
@@ -113,10 +109,10 @@ async def edit(
     `placement` takes the mesh of the new code there.
     """
     targets = [options_of(Target, target) for target in body.targets]
-    asked, most = options_of(EditOptions, body), service.settings.max_codes
-    asked = asked if mesh is None else replace(asked, mesh=mesh)
-    found = await codes.edit(service.workers, caller, model, body.latent, targets, asked, most)
-    return found_response(service, found)
+    wanted, most = options_of(EditOptions, body), asked.service.settings.max_codes
+    wanted = wanted if mesh is None else replace(wanted, mesh=mesh)
+    found = await codes.edit(asked.caller, model, body.latent, targets, wanted, most)
+    return encoded_response(asked.service, found, "application/json")
 
 
 @router.post("/sample", responses=problems(400, 404, 413, 415, 422), response_model=SampleAnswer)
@@ -136,9 +132,7 @@ async def sample(
     openapi_extra=upload("A mesh or a point cloud."),
 )
 async def fit(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     options: Annotated[FitQuery, Query()],
     format: Annotated[str | None, one_of((*POINT_FORMATS, ARCHIVE)), _FORMAT] = None,
@@ -149,10 +143,10 @@ async def fit(
     `Accept: text/event-stream` each event has JSON: `{"progress": 0.4}` while the search goes on, and this answer or
     `{"problem": …}` as the last.
     """
-    asked = partial(_asked, service, request, model, FitOptions, options, FitRequest)
-    fit = partial(codes.fit, service.workers, service.sandbox, caller, asked, await _upload(request, format))
-    if EVENTS in request.headers.get("accept", ""):
+    wanted = partial(_options, asked, model, FitOptions, options, FitRequest)
+    fit = partial(codes.fit, asked.caller, asked.service.sandbox, wanted, await _upload(asked.request, format))
+    if EVENTS in asked.request.headers.get("accept", ""):
         found = codes.events(fit)
         first = await anext(found)  # an error up to here still has its own status
-        return StreamingResponse(resumed(request, first, found, b"data: %b\n\n"), media_type=EVENTS)
-    return found_response(service, await fit())
+        return StreamingResponse(resumed(asked.request, first, found, b"data: %b\n\n"), media_type=EVENTS)
+    return encoded_response(asked.service, await fit(), "application/json")

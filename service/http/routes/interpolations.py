@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
@@ -13,11 +14,11 @@ from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.service.http.caching import cache_headers, entity_tag, not_modified
 from shapespace.service.http.dependencies import (
-    CallerDependency,
+    AskedDependency,
     ExamplesOfBody,
     ExamplesQuery,
     Format,
-    MeshQuery,
+    MeshOfBody,
     Model,
     QualityQuery,
     Service,
@@ -38,8 +39,8 @@ from shapespace.service.http.messages.mesh_query import (
 )
 from shapespace.service.http.messages.schemas import InterpolationAnswer
 from shapespace.service.http.negotiation import choose, listed
-from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import encoded_response, file_headers, shape_response, tag_options
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.animation import Animation
 from shapespace.service.use_cases.fields import DIGITS, WholeText
 from shapespace.service.use_cases.sequence import (
@@ -72,7 +73,7 @@ async def create_interpolation(
     model: Model,
     body: Annotated[Animation, Depends(JSONBody(Animation))],
     response: Response,
-    mesh: MeshQuery = None,
+    mesh: MeshOfBody = None,
     examples: ExamplesOfBody = None,
 ) -> InterpolationAnswer:
     """Address of the animation along a path of codes. Nothing is stored: the id holds the whole animation."""
@@ -92,9 +93,7 @@ async def create_interpolation(
     response_class=Response,
 )
 async def get_interpolation(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     id: Id,
     quality: QualityQuery = Quality.AUTO,
     examples: ExamplesQuery = True,
@@ -108,34 +107,34 @@ async def get_interpolation(
     format: Annotated[Format, one_of([*MEDIA_TYPES, "obj"])] = None,
 ) -> Response:
     """The animation: GLB, arrays, a zip of OBJ files, a point cache, USD, or a stream of JSON lines."""
-    chosen = _choose_format(request, format, color)
-    animation, model = _found(service, id, examples=examples)
-    note_model(request, model)
+    chosen = _choose_format(asked.request, format, color)
+    animation, model = _found(asked.service, id, examples=examples)
+    note_model(asked.request, model)
     written_as = SEQUENCE_FORMATS.get(chosen)
     if fps is not None and not (written_as and written_as.timed):
         timed = ", ".join(name for name, each in SEQUENCE_FORMATS.items() if each.timed)
         said = f"{chosen.upper()} files don't say when a frame is shown."
-        raise ProblemError("invalid-request", f"{said} For fps ask for one of {timed}.")
+        raise RefusedError("invalid-request", f"{said} For fps ask for one of {timed}.")
     polygons = bool(written_as and written_as.polygons)
     faces = choose_topology(topology, chosen, model, animation.mesh, polygons=polygons)
     colour_by = color.on(model)
     options = tag_options(quality, colour_by, faces, animation.examples)
     options += [] if fps is None else [f"{fps} frames a second"]
     tag = entity_tag("animation", id, chosen, *options)
-    if answer := not_modified(request, tag):
+    if answer := not_modified(asked.request, tag):
         return answer
     if chosen == "jsonl":
-        lines = sequence_lines(service.workers, caller, model, animation, quality)
+        lines = sequence_lines(asked.caller, model, animation, quality)
         first = await anext(lines)  # an error up to here still has its own status
         return StreamingResponse(
-            resumed(request, first, lines, b"%b\n"), headers=cache_headers(tag), media_type=JSON_LINES
+            resumed(asked.request, first, lines, b"%b\n"), headers=cache_headers(tag), media_type=JSON_LINES
         )
     written = await sequence_file(
-        service.workers, caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
+        asked.caller, model, animation, quality, chosen, faces, fps or FRAMES_PER_SECOND, colour_by
     )
-    diagnostics = {**(written.diagnostics or {}), **written.facts}
-    headers = cache_headers(tag) | file_headers(diagnostics, f"{model.manifest.name}-animation.{chosen}")
-    return encoded_response(service, written, headers, MEDIA_TYPES[chosen])
+    told = replace(written, diagnostics={**(written.diagnostics or {}), **written.facts})
+    headers = cache_headers(tag) | file_headers(told, f"{model.manifest.name}-animation.{chosen}")
+    return encoded_response(asked.service, written, MEDIA_TYPES[chosen], headers)
 
 
 @router.get(
@@ -144,9 +143,7 @@ async def get_interpolation(
     response_class=Response,
 )
 async def get_frame(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     id: Id,
     k: Annotated[WholeText, Path(description="Index of the frame, from 0.", json_schema_extra={"minimum": 0})],
     options: FrameQuery,
@@ -154,11 +151,11 @@ async def get_frame(
     examples: ExamplesQuery = True,
 ) -> Response:
     """One frame of an animation in any mesh format."""
-    animation, model = _found(service, id, examples=examples)
-    note_model(request, model)
+    animation, model = _found(asked.service, id, examples=examples)
+    note_model(asked.request, model)
     code, memory = frame_code(model, animation, k), frame_memory(model, animation, k)
     wanted = options.shape(model, code, animation.mesh, quality, examples=memory)
-    return await shape_response(service, request, caller, model, wanted)
+    return await shape_response(asked, model, wanted)
 
 
 def _found(service: Service, id: str, *, examples: bool) -> tuple[Animation, ShapeModel]:

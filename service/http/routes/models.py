@@ -20,8 +20,8 @@ from shapespace.service.http.messages.cards import (
     ModelList,
     ModelSummary,
 )
-from shapespace.service.http.problems import ProblemError
 from shapespace.service.http.responses import RangedFile
+from shapespace.service.refusals import RefusedError
 
 router = APIRouter(prefix="/v1/models", tags=["models"])
 
@@ -55,7 +55,7 @@ async def model_decoder(request: Request, model: Model) -> Response:
     entry = model.manifest.decoder
     if entry is None:
         name = model.manifest.name
-        raise ProblemError("not-found", f"{name} has no decoder.onnx. `shapespace export` adds it to a bundle.")
+        raise RefusedError("not-found", f"{name} has no decoder.onnx. `shapespace export` adds it to a bundle.")
     tag = entity_tag("decoder", model.manifest.files[entry.file].sha256)
     if unchanged := not_modified(request, tag):
         return unchanged

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Request, Response
 from shapespace import __version__
 from shapespace.files.reading import OCTET_STREAM
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.http.dependencies import CallerDependency, Model, Service, ServiceDependency
+from shapespace.service.http.dependencies import AskedDependency, Model, Service, ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.binary_tensors import HEADER, read_codes, read_request, write_answer
 from shapespace.service.http.messages.bodies import read
@@ -27,13 +27,13 @@ from shapespace.service.http.messages.open_inference import (
     ModelLimits,
     ModelMetadata,
     ModelReadiness,
+    ModelStatistics,
     ServerMetadata,
     StatisticsAnswer,
     model_configuration,
     model_metadata,
-    model_statistics,
 )
-from shapespace.service.http.responses import diagnostics_header, encoded_response
+from shapespace.service.http.responses import encoded_response, file_headers
 from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import infer as infer_file
 from shapespace.service.use_cases.many_shapes import most_inferred
@@ -102,7 +102,7 @@ async def repository_index(service: ServiceDependency, request: Request) -> list
 @router.get("/models/stats", responses=problems(404, 422), name="all_statistics")
 async def all_statistics(service: ServiceDependency) -> StatisticsAnswer:
     """Numbers and times of the inferences of every version of every model."""
-    return _statistics(service, service.repository.all())
+    return _all_statistics(service, service.repository.all())
 
 
 @router.get(f"{_VERSION}/stats", responses=problems(404, 422), name="version_statistics")
@@ -111,7 +111,7 @@ async def statistics(service: ServiceDependency, request: Request, model: Model)
     """Numbers and times of the inferences of a model, for each version unless one is named."""
     named = "version" in request.path_params or "version" in request.query_params
     every = (each for each in service.repository.all() if each.manifest.name == model.manifest.name)
-    return _statistics(service, [model] if named else every)
+    return _all_statistics(service, [model] if named else every)
 
 
 @router.get(f"{_VERSION}/config", responses=problems(404, 422), name="version_configuration")
@@ -137,16 +137,16 @@ async def model_ready(model: Model) -> ModelReadiness:
 
 @router.post(f"{_VERSION}/infer", name="infer_version", **_INFER)
 @router.post(f"{_DEFAULT}/infer", name="infer", **_INFER)
-async def infer(service: ServiceDependency, request: Request, caller: CallerDependency, model: Model) -> Response:
+async def infer(asked: AskedDependency, model: Model) -> Response:
     """Lengths and angles, vertices, or both, for latent codes."""
+    service, request = asked.service, asked.request
     message, tail = await asyncio.to_thread(read_request, await request.body(), request.headers.get(HEADER))
     require_count(message.inputs[0].shape[0], service.settings.max_codes, "inputs[0].shape")
     options, write = message.parameters, partial(write_answer, message, model)
-    tally, began = service.inferences[model.manifest.name, model.manifest.version], time.perf_counter()
+    tally, began = _statistics(service, model), time.perf_counter()
     try:
         written = await infer_file(
-            service.workers,
-            caller,
+            asked.caller,
             model,
             read_codes(message, tail),
             options.bounds,
@@ -156,13 +156,12 @@ async def infer(service: ServiceDependency, request: Request, caller: CallerDepe
             write,
         )
     except Exception:
-        tally.add("fail", time.perf_counter() - began)
+        tally.inference_stats.fail.add(time.perf_counter() - began)
         raise
     tally.succeed(message.inputs[0].shape[0], time.perf_counter() - began, written.seconds)
-    headers = diagnostics_header(written.diagnostics) if written.diagnostics else {}
-    if HEADER not in written.facts:
-        return encoded_response(service, written, headers, "application/json")
-    return encoded_response(service, written, headers | {HEADER: str(written.facts[HEADER])}, OCTET_STREAM)
+    media_type = OCTET_STREAM if HEADER in written.facts else "application/json"
+    headers = file_headers(written) | {name: str(value) for name, value in written.facts.items()}
+    return encoded_response(service, written, media_type, headers)
 
 
 def _limits(service: Service, model: ShapeModel) -> ModelLimits:
@@ -171,11 +170,10 @@ def _limits(service: Service, model: ShapeModel) -> ModelLimits:
     return ModelLimits(max_codes=codes, max_body=settings.max_body, deadline=settings.deadline)
 
 
-def _statistics(service: Service, models: Iterable[ShapeModel]) -> StatisticsAnswer:
-    found = {(model.manifest.name, int(model.manifest.version)): model for model in models}
-    return StatisticsAnswer(
-        model_stats=[
-            model_statistics(model, service.inferences[name, str(version)])
-            for (name, version), model in sorted(found.items(), key=lambda item: item[0])
-        ]
-    )
+def _statistics(service: Service, model: ShapeModel) -> ModelStatistics:
+    return service.inferences.setdefault((model.manifest.name, model.manifest.version), ModelStatistics.of(model))
+
+
+def _all_statistics(service: Service, models: Iterable[ShapeModel]) -> StatisticsAnswer:
+    ordered = sorted(models, key=lambda model: (model.manifest.name, int(model.manifest.version)))
+    return StatisticsAnswer(model_stats=[_statistics(service, model) for model in ordered])

@@ -8,7 +8,7 @@ from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from shapespace.service.http.dependencies import ServiceDependency
 from shapespace.service.http.description import problems
 from shapespace.service.http.messages.schemas import Health, Readiness
-from shapespace.service.http.problems import ProblemError
+from shapespace.service.refusals import RefusedError
 
 router = APIRouter()
 
@@ -23,10 +23,10 @@ async def live() -> Health:
 async def ready(service: ServiceDependency) -> Readiness:
     """Whether the server has a model and is not shutting down; names faults of the default versions."""
     if service.draining:
-        raise ProblemError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
+        raise RefusedError("not-ready", "The server is about to end. Send requests to another one.", ready=False)
     if len(service.repository) == 0:
         detail = "No model is served. Put a bundle into the models folder; the log says more."
-        raise ProblemError("not-ready", detail, ready=False)
+        raise RefusedError("not-ready", detail, ready=False)
     return Readiness(ready=True, faults=service.repository.faults or None)
 
 
@@ -38,9 +38,9 @@ async def ready(service: ServiceDependency) -> Readiness:
         200: {"description": "Prometheus's text format.", "content": {"text/plain": {"schema": {"type": "string"}}}}
     },
 )
-async def metrics(service: ServiceDependency) -> Response:
+async def metrics(request: Request) -> Response:
     """Metrics of the server since its start."""
-    return Response(generate_latest(service.metrics.registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(request.app.state.metrics), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 @router.get("/openapi.json", include_in_schema=False)

@@ -19,9 +19,10 @@ from starlette.types import Scope
 
 from shapespace.files.poster import poster
 from shapespace.page_scripts import PAGE, joined_scripts
-from shapespace.service.http.caching import CachedAnswer, entity_tag
-from shapespace.service.http.dependencies import Model, ServiceDependency
+from shapespace.service.http.caching import entity_tag
+from shapespace.service.http.dependencies import AskedDependency, Model, ServiceDependency
 from shapespace.service.http.responses import RangedFile, cached_response
+from shapespace.service.use_cases.batch import EncodedFile
 
 router = APIRouter(include_in_schema=False)
 
@@ -76,15 +77,15 @@ async def page(request: Request, service: ServiceDependency) -> Response:
 
 
 @router.get("/poster/{name}.svg")
-async def drawing(service: ServiceDependency, request: Request, model: Model) -> Response:
+async def drawing(asked: AskedDependency, model: Model) -> Response:
     """A drawing of the reference, which the page shows until its scripts have arrived."""
 
-    async def compute() -> tuple[CachedAnswer, dict[str, float]]:
+    async def compute() -> EncodedFile:
         began = time.perf_counter()
         content = await asyncio.to_thread(poster, model.reference)
-        return CachedAnswer(content, {}), {"encode": time.perf_counter() - began}
+        return EncodedFile(content, {"encode": time.perf_counter() - began})
 
-    return await cached_response(service, request, entity_tag("poster", model.digest), "image/svg+xml", compute)
+    return await cached_response(asked, entity_tag("poster", model.digest), "image/svg+xml", "", compute)
 
 
 def assets() -> BaseRoute:

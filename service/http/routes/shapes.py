@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Response
 
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape import Quality
-from shapespace.service.http.caching import CachedAnswer, entity_tag
+from shapespace.service.http.caching import entity_tag
 from shapespace.service.http.dependencies import (
-    CallerDependency,
+    AskedDependency,
     ExamplesOfBody,
     ExamplesQuery,
     Format,
+    MeshOfBody,
     MeshQuery,
     Model,
     QualityOfBody,
     QualityQuery,
-    ServiceDependency,
     one_of,
 )
 from shapespace.service.http.description import binary, mesh_answers, problems
@@ -34,7 +35,7 @@ from shapespace.service.http.messages.schemas import (
 )
 from shapespace.service.http.negotiation import choose, listed
 from shapespace.service.http.responses import cached_response, encoded_response, file_headers, shape_response
-from shapespace.service.use_cases.batch import Timings, require_count
+from shapespace.service.use_cases.batch import require_count
 from shapespace.service.use_cases.many_shapes import VERTICES_TYPES, blend_shapes_file, nric_file, vertices_file
 from shapespace.service.use_cases.shape_formats import SHAPE_FORMATS
 
@@ -46,9 +47,7 @@ _MESH_RESPONSES = mesh_answers("The mesh, with its diagnostics in `Shape-Diagnos
 
 @router.get("/mesh", responses=_MESH_RESPONSES | problems(404, 406, 422, 503, 504), response_class=Response)
 async def get_mesh(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     options: SingleMeshQuery,
     latent: Annotated[
@@ -58,9 +57,7 @@ async def get_mesh(
             openapi_examples={"a code": {"value": [1, 2, 3, 4]}},
         ),
     ] = None,
-    mesh: Annotated[
-        MeshChoice, Query(description="Which mesh to answer, if the model has a fine one.")
-    ] = MeshChoice.FINE,
+    mesh: MeshQuery = MeshChoice.FINE,
     bounds: Annotated[Bounds, Query(description="What to do with a code outside the bounds.")] = Bounds.ALLOW,
     quality: QualityQuery = Quality.AUTO,
     examples: ExamplesQuery = True,
@@ -68,20 +65,18 @@ async def get_mesh(
     """The shape of a code as a mesh file, by an address for links and browsers."""
     code = None if latent is None else model.latents.code(numbers(latent, "latent"), bounds)
     wanted = options.shape(model, code, mesh, quality, bounds, examples=examples)
-    return await shape_response(service, request, caller, model, wanted)
+    return await shape_response(asked, model, wanted)
 
 
 @router.post(
     "/mesh", responses=_MESH_RESPONSES | problems(400, 404, 406, 413, 415, 422, 503, 504), response_class=Response
 )
 async def post_mesh(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     body: Annotated[MeshRequest, Depends(JSONBody(MeshRequest))],
     options: SingleMeshQuery,
-    mesh: MeshQuery = None,
+    mesh: MeshOfBody = None,
     quality: QualityOfBody = None,
     examples: ExamplesOfBody = None,
 ) -> Response:
@@ -90,7 +85,7 @@ async def post_mesh(
     how = mesh or body.mesh, quality or body.quality, body.bounds, body.covariance
     remembered = body.examples if examples is None else examples
     wanted = options.shape(model, code, *how, remembered)
-    return await shape_response(service, request, caller, model, wanted)
+    return await shape_response(asked, model, wanted)
 
 
 @router.post(
@@ -100,12 +95,10 @@ async def post_mesh(
     response_model=VerticesAnswer,
 )
 async def post_vertices(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     body: Annotated[VerticesRequest, Depends(JSONBody(VerticesRequest))],
-    mesh: MeshQuery = None,
+    mesh: MeshOfBody = None,
     quality: QualityOfBody = None,
     exact: Annotated[
         bool, Query(description="Also answer the true discrete exponentials, as `exact` in the body does.")
@@ -114,11 +107,10 @@ async def post_vertices(
     format: Annotated[Format, one_of(VERTICES_TYPES)] = None,
 ) -> Response:
     """Positions of many shapes."""
-    chosen = choose(VERTICES_TYPES, format, listed(request.headers, "accept"))
-    require_count(len(body.latents), service.settings.max_codes)
+    chosen = choose(VERTICES_TYPES, format, listed(asked.request.headers, "accept"))
+    require_count(len(body.latents), asked.service.settings.max_codes)
     written = await vertices_file(
-        service.workers,
-        caller,
+        asked.caller,
         model,
         body.latents,
         body.bounds,
@@ -129,8 +121,8 @@ async def post_vertices(
         place=place,
         faces=body.faces,
     )
-    headers = {"Vary": "Accept", **file_headers(written.diagnostics or {}, f"{model.manifest.name}.{chosen}")}
-    return encoded_response(service, written, headers, VERTICES_TYPES[chosen])
+    headers = {"Vary": "Accept", **file_headers(written, f"{model.manifest.name}.{chosen}")}
+    return encoded_response(asked.service, written, VERTICES_TYPES[chosen], headers)
 
 
 @router.post(
@@ -140,15 +132,14 @@ async def post_vertices(
     response_model_exclude_none=True,
 )
 async def post_nric(
-    service: ServiceDependency,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
     body: Annotated[NRICRequest, Depends(JSONBody(NRICRequest))],
 ) -> Response:
     """Lengths and angles as the networks predict them, before reconstruction."""
-    require_count(len(body.latents), service.settings.max_codes)
-    written = await nric_file(service.workers, caller, model, body.latents, body.bounds, factors=body.factors)
-    return encoded_response(service, written, {}, "application/json")
+    require_count(len(body.latents), asked.service.settings.max_codes)
+    written = await nric_file(asked.caller, model, body.latents, body.bounds, factors=body.factors)
+    return encoded_response(asked.service, written, "application/json")
 
 
 @router.get(
@@ -157,23 +148,13 @@ async def post_nric(
     response_class=Response,
 )
 async def get_blend_shapes(
-    service: ServiceDependency,
-    request: Request,
-    caller: CallerDependency,
+    asked: AskedDependency,
     model: Model,
-    mesh: Annotated[
-        MeshChoice, Query(description="Which mesh to answer, if the model has a fine one.")
-    ] = MeshChoice.FINE,
+    mesh: MeshQuery = MeshChoice.FINE,
 ) -> Response:
     """The shape of code 0 with a morph target for each bound of each coordinate: sliders without this server.
 
     `asset.extras.error` of the file is the distance of the linear blend from the model's shapes.
     """
-
-    async def compute() -> tuple[CachedAnswer, Timings]:
-        content, seconds = await blend_shapes_file(service.workers, caller, model, mesh)
-        name = f"{model.manifest.name}-blendshapes.glb"
-        return CachedAnswer(content, {"Content-Disposition": f'inline; filename="{name}"'}), seconds
-
-    tag = entity_tag("blend shapes", model.digest, mesh)
-    return await cached_response(service, request, tag, _GLB["glb"], compute)
+    tag, name = entity_tag("blend shapes", model.digest, mesh), f"{model.manifest.name}-blendshapes.glb"
+    return await cached_response(asked, tag, _GLB["glb"], name, partial(blend_shapes_file, asked.caller, model, mesh))

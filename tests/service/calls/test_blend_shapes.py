@@ -14,8 +14,8 @@ from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases import many_shapes
-from shapespace.service.use_cases.batch import TooManyCodesError
 from shapespace.service.use_cases.many_shapes import blend_shapes_file
 from tests.service.conftest import ROOT, Server
 from tests.service.glb import GLB, khronos_report
@@ -98,8 +98,8 @@ def test_more_than_an_answer_holds_is_refused_before_it_is_made(
 ) -> None:
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", 41 * 1000 - 1)
     workers = Workers(1, 0, deadline=60)
-    with pytest.raises(TooManyCodesError, match="41 shapes of 1000 vertices are too many"):
-        asyncio.run(blend_shapes_file(workers, Caller("somebody", asyncio.Event().wait), model, MeshChoice.COARSE))
+    with pytest.raises(RefusedError, match="41 shapes of 1000 vertices are too many"):
+        asyncio.run(blend_shapes_file(Caller(workers, "somebody", asyncio.Event().wait), model, MeshChoice.COARSE))
     workers.close()
 
 

@@ -11,7 +11,7 @@ import pytest
 from shapespace.files.formats import VTK_FORMATS
 from shapespace.files.limits import Limits
 from shapespace.files.reading import read_arrays
-from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox import READ, Sandbox
 from shapespace.service.use_cases import shape_formats
 from shapespace.service.use_cases.codes import Upload, read_upload
 from shapespace.solve.deadline import Deadline
@@ -48,7 +48,7 @@ def test_a_server_without_the_package_offers_no_vtk(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("format", VTK_FORMATS)
 def test_one_process_reads_several_files_within_its_memory(format: str) -> None:
     content = VTK_FORMATS[format].encode(reference().vertices, reference().faces)
-    with Sandbox(1) as sandbox:
+    with Sandbox(1, READ) as sandbox:
         for _ in range(2):
             upload = Upload(deque([memoryview(content)]), "", None)
             meshes, _ = read_upload(sandbox, upload, Limits(10**5, 10**5), Deadline(300.0), points=True)

@@ -5,11 +5,12 @@ import re
 import httpx
 import numpy as np
 
-from shapespace.service.http.caching import AnswerCache, CachedAnswer
+from shapespace.service.http.caching import AnswerCache
+from shapespace.service.use_cases.batch import EncodedFile
 
 
-def answer(size: int) -> CachedAnswer:
-    return CachedAnswer(bytes(size), {"Shape-Diagnostics": "{}"})
+def answer(size: int) -> EncodedFile:
+    return EncodedFile(bytes(size), {})
 
 
 def test_what_is_kept_never_grows_over_the_limit_and_the_last_is_always_there() -> None:
@@ -17,11 +18,11 @@ def test_what_is_kept_never_grows_over_the_limit_and_the_last_is_always_there() 
     for k in range(500):
         tag = str(rng.integers(40))
         cache.keep(tag, answer(int(rng.integers(1, 30_000))))
-        assert sum(kept.size for kept in cache.values()) <= 100_000
+        assert sum(map(cache.getsizeof, cache.values())) <= 100_000
         assert cache.get(tag)
         cache.get(str(k % 40))
     assert len(cache) > 3
-    assert cache.currsize == sum(kept.size for kept in cache.values())
+    assert cache.currsize == sum(map(cache.getsizeof, cache.values()))
 
 
 def test_an_answer_that_is_too_large_is_not_kept_and_drives_out_no_other() -> None:

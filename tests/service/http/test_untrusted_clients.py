@@ -21,7 +21,8 @@ import httpx
 import pytest
 
 from shapespace.service.http.connections import HEAD_BYTES, HEAD_SECONDS, LINGER_BYTES, STALL_SECONDS
-from shapespace.service.use_cases.animation import Animation, UnknownInterpolationError
+from shapespace.service.refusals import RefusedError
+from shapespace.service.use_cases.animation import Animation
 from tests.faults.serving import peak_memory
 from tests.service.conftest import ROOT, Server, Start, starting
 from tests.service.watching import SOON, eventually, samples, value
@@ -426,7 +427,7 @@ def cost(id: str) -> float:
 
     def once() -> float:
         began = time.thread_time()
-        with contextlib.suppress(UnknownInterpolationError):
+        with contextlib.suppress(RefusedError):
             Animation.from_id(id)
         return time.thread_time() - began
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shapespace.service.limits import sandbox
 from shapespace.service.limits.sandbox import Sandbox
-from shapespace.service.limits.sandbox_errors import (
+from shapespace.service.limits.sandbox_child import GROWTH
+from shapespace.service.limits.sandbox_messages import (
     ClosedError,
     DiedError,
     FailedError,
@@ -24,30 +24,23 @@ from shapespace.service.limits.sandbox_errors import (
     SandboxError,
 )
 from shapespace.solve.deadline import Deadline
-from tests.service import tasks
 from tests.service.conftest import ROOT
 from tests.service.watching import children_of, eventually
 
 MIB = 2**20
-
-
-@pytest.fixture(autouse=True)
-def _tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in vars(tasks).items():
-        if callable(value) and value.__module__ == tasks.__name__:
-            monkeypatch.setitem(sandbox.TASKS, name, f"{tasks.__name__}:{name}")
+TASK = "tests.service.tasks:perform"
 
 
 @pytest.fixture
 def box() -> Iterator[Sandbox]:
-    with Sandbox(2) as box:
+    with Sandbox(2, TASK) as box:
         yield box
 
 
 def call(box: Sandbox, task: str, body: bytes = b"", seconds: float = 60, memory: int = 256 * MIB, **facts: object):
     pieces = deque(body[k : k + 1000] for k in range(0, len(body), 1000))
     most = len(body) * 4
-    return box.call(task, facts, pieces, deadline=Deadline(seconds), memory=memory, most=most)
+    return box.call({"task": task, **facts}, pieces, deadline=Deadline(seconds), memory=memory, most=most)
 
 
 @pytest.fixture
@@ -74,7 +67,7 @@ def test_facts_bodies_and_arrays_go_there_and_come_back(box: Sandbox) -> None:
 
 def test_a_body_is_given_away_piece_by_piece(box: Sandbox) -> None:
     body = deque([b"x" * MIB] * 3)
-    box.call("echo", body=body, deadline=Deadline(60), memory=64 * MIB, most=3 * MIB)
+    box.call({"task": "echo"}, body, deadline=Deadline(60), memory=64 * MIB, most=3 * MIB)
     assert not body
 
 
@@ -85,7 +78,7 @@ def test_one_process_does_one_thing_after_the_other(box: Sandbox) -> None:
 
 
 def test_a_process_that_is_prepared_is_the_one_that_is_used(children: Callable[[], set[int]], box: Sandbox) -> None:
-    box.prepare("echo")
+    box.prepare()
     prepared = children()
     assert call(box, "echo")[0]["pid"] in prepared
 
@@ -95,8 +88,8 @@ def test_several_at_once_and_no_more_than_there_may_be(box: Sandbox) -> None:
         found = list(threads.map(lambda _: call(box, "echo")[0]["pid"], range(16)))
         assert len(set(found)) <= 2
         deadlines = [Deadline(600), Deadline(600)]
-        busy = [threads.submit(box.call, "wait", deadline=each, memory=64 * MIB) for each in deadlines]
-        eventually(lambda: len(box._busy) == 2)
+        busy = [threads.submit(box.call, {"task": "wait"}, deadline=each, memory=64 * MIB) for each in deadlines]
+        eventually(box._free.empty)
         with pytest.raises(LateError, match="every process was busy"):
             call(box, "echo", seconds=0.5)
         for each in deadlines:
@@ -116,8 +109,8 @@ def test_what_takes_too_long_is_ended(box: Sandbox, task: str) -> None:
 def test_what_nobody_waits_for_any_more_is_ended(box: Sandbox) -> None:
     pid, deadline = call(box, "echo")[0]["pid"], Deadline(60)
     with ThreadPoolExecutor(1) as threads:
-        busy = threads.submit(box.call, "wait", deadline=deadline, memory=64 * MIB)
-        eventually(lambda: len(box._busy) == 1)
+        busy = threads.submit(box.call, {"task": "wait"}, deadline=deadline, memory=64 * MIB)
+        eventually(lambda: box._free.qsize() == 1)
         deadline.call_off()
         assert isinstance(busy.exception(60), LateError)
     assert not alive(pid)
@@ -125,7 +118,7 @@ def test_what_nobody_waits_for_any_more_is_ended(box: Sandbox) -> None:
 
 def test_a_process_that_does_not_listen_is_no_trap(children: Callable[[], set[int]], box: Sandbox) -> None:
     """The child is killed while its body is still being sent."""
-    box.prepare("echo")
+    box.prepare()
     (pid,) = children()
     os.kill(pid, signal.SIGSTOP)
     with pytest.raises(LateError):
@@ -141,7 +134,7 @@ def test_a_process_that_does_not_listen_is_no_trap(children: Callable[[], set[in
         ("kill", OutOfMemoryError, "probably because memory ran out"),
         ("babble", DiedError, "can't be read"),
         ("lie", DiedError, "can't be read"),
-        ("objects", DiedError, "can't be read"),
+        ("text", DiedError, "can't be read"),
         ("mistake", FailedError, r"KeyError: 'missing' \(tasks.py, line \d+\)"),
     ],
 )
@@ -164,7 +157,7 @@ def test_what_a_task_finds_wrong_is_told_as_it_says_it(box: Sandbox) -> None:
 
 def test_answers_are_no_longer_than_expected(box: Sandbox) -> None:
     with pytest.raises(DiedError):
-        box.call("echo", body=deque([bytes(100)]), deadline=Deadline(60), memory=MIB, most=99)
+        box.call({"task": "echo"}, deque([bytes(100)]), deadline=Deadline(60), memory=MIB, most=99)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits what a process maps")
@@ -180,7 +173,7 @@ def test_memory_is_limited_for_each_task(box: Sandbox) -> None:
 def test_a_process_that_keeps_too_much_is_replaced(box: Sandbox) -> None:
     pid = call(box, "echo")[0]["pid"]
     assert call(box, "keep", size=20 * MIB)[0]["pid"] == pid
-    assert call(box, "keep", size=sandbox.GROWTH)[0]["pid"] == pid
+    assert call(box, "keep", size=GROWTH)[0]["pid"] == pid
     assert call(box, "echo")[0]["pid"] != pid
     assert not alive(pid)
 
@@ -215,7 +208,7 @@ def test_signals_to_the_whole_group_are_for_the_parent(box: Sandbox) -> None:
 
 
 def test_closing_ends_what_runs_and_leaves_nothing(children: Callable[[], set[int]]) -> None:
-    box = Sandbox(2)
+    box = Sandbox(2, TASK)
     with ThreadPoolExecutor(2) as threads:
         busy = threads.submit(call, box, "spin")
         call(box, "echo")
@@ -225,21 +218,17 @@ def test_closing_ends_what_runs_and_leaves_nothing(children: Callable[[], set[in
     assert children() == set()
     with pytest.raises(ClosedError):
         call(box, "echo")
-    box.prepare("echo")
+    box.prepare()
     assert children() == set()
 
 
-def test_a_process_that_does_not_begin_is_told(
-    children: Callable[[], set[int]], monkeypatch: pytest.MonkeyPatch, box: Sandbox
-) -> None:
-    monkeypatch.setitem(sandbox.TASKS, "none", "tests.service.nowhere:none")
-    box.prepare("none")
-    with pytest.raises(FailedError, match=r"ModuleNotFoundError: No module named 'tests\.service\.nowhere'"):
-        call(box, "none")
-    assert call(box, "echo")[0]["pid"] in children()
-    box.close()
-    box = Sandbox(1)
+def test_a_process_that_does_not_begin_is_told(monkeypatch: pytest.MonkeyPatch, box: Sandbox) -> None:
+    with Sandbox(1, "tests.service.nowhere:none") as nowhere:
+        nowhere.prepare()
+        with pytest.raises(FailedError, match=r"ModuleNotFoundError: No module named 'tests\.service\.nowhere'"):
+            call(nowhere, "echo")
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    box.prepare()
     with pytest.raises(NoProcessError, match="no process can be started"):
         call(box, "echo")
 
@@ -248,13 +237,13 @@ def test_a_process_that_does_not_begin_is_told(
 def test_nothing_survives_a_parent_that_is_killed(task: str) -> None:
     program = f"""
 import sys, threading, time
-from shapespace.service.limits import sandbox
-sandbox.TASKS["task"] = "tests.service.tasks:{task}"
-box = sandbox.Sandbox(1)
-box.prepare("task")
-threading.Thread(target=lambda: box.call("task", deadline=Deadline(600), memory=2**28), daemon=True).start()
+from shapespace.service.limits.sandbox import Deadline, Sandbox
+box = Sandbox(1, "{TASK}")
+box.prepare()
+call = dict(facts={{"task": "{task}"}}, deadline=Deadline(600), memory=2**28)
+threading.Thread(target=lambda: box.call(**call), daemon=True).start()
 time.sleep(1)
-print(*[child._process.pid for child in (*box._idle, *box._busy)], flush=True)
+print(*[child._process.pid for child in box._children], flush=True)
 time.sleep(600)
 """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

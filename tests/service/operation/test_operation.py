@@ -19,7 +19,8 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.service.__main__ import _serve
 from shapespace.service.http.app import create_app
 from shapespace.service.http.connections import IDLE_SECONDS
-from shapespace.service.limits.workers import Caller, DeadlineError, Workers
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.refusals import RefusedError
 from shapespace.service.repository.validation import BundleValidator
 from shapespace.service.settings import Settings, cpu_quota
 from shapespace.service.use_cases.many_shapes import nric_file
@@ -86,13 +87,14 @@ def test_a_deadline_holds_between_codes_before_any_reconstruction_too(small_mode
     model = ShapeModel(read_bundle(small_models / "small" / "10"), 1)
 
     async def ask() -> None:
-        workers, caller = Workers(1, 0, deadline=0.1), Caller("", asyncio.Event().wait)
+        workers = Workers(1, 0, deadline=0.1)
+        caller = Caller(workers, "", asyncio.Event().wait)
         try:
-            await nric_file(workers, caller, model, [CODE["latent"]] * 5000, Bounds.ALLOW, factors=False)
+            await nric_file(caller, model, [CODE["latent"]] * 5000, Bounds.ALLOW, factors=False)
         finally:
             workers.close()
 
-    with pytest.raises(DeadlineError):
+    with pytest.raises(RefusedError):
         asyncio.run(ask())
 
 
@@ -159,11 +161,6 @@ def test_the_processors_of_a_container_are_those_of_its_quota(tmp_path: Path) ->
     for quota, expected in (("max", everything), ("100000", 1), ("20000", 1), ("99900000", everything)):
         (tmp_path / "cpu.max").write_text(f"{quota} 100000\n")
         assert cpu_quota(tmp_path) == expected
-    old = tmp_path / "old" / "cpu"
-    old.mkdir(parents=True)
-    (old / "cpu.cfs_quota_us").write_text("100000\n")
-    (old / "cpu.cfs_period_us").write_text("100000\n")
-    assert cpu_quota(tmp_path / "old") == 1
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from prometheus_client import CollectorRegistry
 
 from shapespace.service.limits.quota import Quota
 from shapespace.service.limits.workers import Workers
@@ -155,14 +156,15 @@ def test_bundles_that_do_harm_are_refused_while_the_others_are_served(shared: tu
 def test_a_reload_that_fails_whole_is_counted(tmp_path: Path) -> None:
     # No request or bundle is known to cause this.
     repository = ModelRepository(tmp_path)  # of no bundles
-    metrics = Metrics(repository, Workers(1, 0, 1), Quota(10))
+    registry = CollectorRegistry()
+    metrics = Metrics(registry, repository, Workers(1, 0, 1), Quota(10, "full"))
 
     def broken() -> Changes:
         raise RuntimeError
 
     repository.reload = broken  # type: ignore[method-assign]
     asyncio.run(Reloader(repository, metrics).reload())
-    assert metrics.registry.get_sample_value("shapespace_reloaded_bundles_total", {"result": "failed"}) == 1
+    assert registry.get_sample_value("shapespace_reloaded_bundles_total", {"result": "failed"}) == 1
 
 
 def test_requests_for_a_reload_before_it_begins_are_one(tmp_path: Path) -> None:
@@ -174,7 +176,7 @@ def test_requests_for_a_reload_before_it_begins_are_one(tmp_path: Path) -> None:
         return Changes()
 
     repository.reload = count  # type: ignore[method-assign]
-    reloader = Reloader(repository, Metrics(repository, Workers(1, 0, 1), Quota(10)))
+    reloader = Reloader(repository, Metrics(CollectorRegistry(), repository, Workers(1, 0, 1), Quota(10, "full")))
 
     async def ask(times: int) -> None:
         await asyncio.gather(*(reloader.reload() for _ in range(times)))

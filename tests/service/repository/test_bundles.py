@@ -23,7 +23,6 @@ from shapespace.bundle.reader import BundleError, read_bundle
 from shapespace.files.npz import npz_bytes
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits import sandbox
 from shapespace.service.repository import validation
 from shapespace.service.repository.repository import Changes, ModelRepository
 from shapespace.service.repository.validation import BundleValidator
@@ -450,7 +449,7 @@ def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
     assert messages(caplog) == ["bundle a/1 is not served: loaded in a separate process, it took longer than 8 s"]
 
     write_bundle(tmp_path, "c")
-    monkeypatch.setitem(sandbox.TASKS, "validate", "tests.service.tasks:crash_at_c")
+    monkeypatch.setattr(validation, "VALIDATE", "tests.service.tasks:crash_at_c")
     assert repository.reload() == Changes(refused=["a/1", "c/1"])
     assert messages(caplog)[-1] == "bundle c/1 is not served: loaded in a separate process, it died of SIGSEGV"
 

@@ -12,9 +12,9 @@ import httpx
 import pytest
 
 from shapespace.files.limits import Limits
-from shapespace.service.limits.sandbox import Sandbox
+from shapespace.service.limits.sandbox import READ, Sandbox
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.codes import Upload, read_upload
-from shapespace.service.use_cases.uploads import UploadError
 from shapespace.solve.deadline import Deadline
 from tests.faults.serving import peak_memory
 from tests.gltf_documents import BINARY, chain, document, doubling, glb, graph, ring
@@ -35,7 +35,7 @@ LIMITS = Limits(2**15, 2**16)
 
 @pytest.fixture(scope="module")
 def sandbox() -> Iterator[Sandbox]:
-    with Sandbox(1) as sandbox:
+    with Sandbox(1, READ) as sandbox:
         yield sandbox
 
 
@@ -51,7 +51,7 @@ def test_an_attack_is_refused_in_one_sentence_or_read_as_the_mesh_it_holds(
     sentence = ""
     try:
         ((vertices, faces, _),), _ = read_upload(sandbox, upload, LIMITS, Deadline(SECONDS))
-    except UploadError as error:
+    except RefusedError as error:
         sentence = str(error)
     assert (sentence and "\n" not in sentence and len(sentence) < 400) or (
         0 < len(vertices) <= LIMITS.vertices and len(faces) <= LIMITS.faces

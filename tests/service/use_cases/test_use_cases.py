@@ -15,9 +15,10 @@ from shapespace.model.exact_shapes import NoTangentSpaceError
 from shapespace.model.latent_space import Bounds
 from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel
-from shapespace.service.limits.workers import BusyError, Caller, Workers
+from shapespace.service.limits.workers import Caller, Workers
+from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases import batch, many_shapes
-from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile, TooManyCodesError
+from shapespace.service.use_cases.batch import EncodedFile, PiecewiseFile
 from shapespace.service.use_cases.many_shapes import infer, vertices_file
 from shapespace.service.use_cases.one_shape import ShapeRequest, shape_file
 from tests.service.bundles import write_bundle
@@ -31,7 +32,8 @@ async def _stays() -> Exception:
     raise AssertionError
 
 
-CALLER = Caller("somebody", _stays)
+def caller(workers: Workers, client: str = "somebody", *, long: bool = False) -> Caller:
+    return Caller(workers, client, _stays, long)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,7 @@ def test_a_large_file_comes_in_pieces_and_holds_its_memory_until_it_is_read(
     model: ShapeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def both(workers: Workers) -> tuple[bytes, bytes]:
-        ask = (workers, CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
+        ask = (caller(workers), model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
         whole = content(await vertices_file(*ask))
         monkeypatch.setattr(batch, "WHOLE_FILE_BYTES", 100)
         file = (await vertices_file(*ask)).content
@@ -82,11 +84,11 @@ def test_more_than_an_answer_may_hold_is_refused_before_any_work(
     model: ShapeModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
-    ask = (CALLER, model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
-    with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
-        run(lambda workers: vertices_file(workers, *ask))
+    ask = (model, CODES, Bounds.ALLOW, MeshChoice.FINE, "json")
+    with pytest.raises(RefusedError, match="Ask for 1 at most"):
+        run(lambda workers: vertices_file(caller(workers), *ask))
     with pytest.raises(NoTangentSpaceError):
-        run(lambda workers: vertices_file(workers, *ask, exponentials=True))
+        run(lambda workers: vertices_file(caller(workers), *ask, exponentials=True))
 
 
 def test_both_outputs_together_may_be_more_than_an_answer_holds(
@@ -98,15 +100,15 @@ def test_both_outputs_together_may_be_more_than_an_answer_holds(
         latents, write = np.array(CODES), lambda arrays: (iter([b"x"]), {})
         return run(
             lambda workers: infer(
-                workers, CALLER, model, latents, Bounds.ALLOW, MeshChoice.FINE, Quality.FULL, outputs, write
+                caller(workers), model, latents, Bounds.ALLOW, MeshChoice.FINE, Quality.FULL, outputs, write
             )
         )
 
     assert content(ask(["vertices"])) == b"x"
-    with pytest.raises(TooManyCodesError, match="too many for both outputs"):
+    with pytest.raises(RefusedError, match="too many for both outputs"):
         ask(["nric", "vertices"])
     monkeypatch.setattr(many_shapes, "MOST_VERTICES", len(model.reference.vertices))
-    with pytest.raises(TooManyCodesError, match="Ask for 1 at most"):
+    with pytest.raises(RefusedError, match="Ask for 1 at most"):
         ask(["vertices"])
 
 
@@ -114,7 +116,7 @@ def test_long_work_leaves_threads_to_short_work_and_clients_take_turns() -> None
     """One client has long work for all threads and more; others come later."""
 
     async def ask(workers: Workers) -> None:
-        many, other = replace(CALLER, long=True), Caller("somebody else", _stays, long=True)
+        many, other = caller(workers, long=True), caller(workers, "somebody else", long=True)
         running: list[str] = []
         go_on = {name: threading.Event() for name in ("m0", "m1", "m2", "m3", "o0", "o1")}
 
@@ -131,10 +133,10 @@ def test_long_work_leaves_threads_to_short_work_and_clients_take_turns() -> None
 
         async with asyncio.TaskGroup() as group:
             for name in go_on:
-                group.create_task(workers.piece(hold(name), many if name[0] == "m" else other))
+                group.create_task((many if name[0] == "m" else other).run(hold(name)))
             await started(1)
-            for caller in (CALLER, replace(other, long=False)):
-                await workers.piece(lambda _: running.append("short"), caller)
+            for short in (caller(workers), replace(other, long=False)):
+                await short.run(lambda _: running.append("short"))
             assert running == ["m0", "short", "short"], "the other thread runs short work only"
             for count, name in enumerate(("m0", "o0", "m1", "o1", "m2"), 4):
                 go_on[name].set()
@@ -152,16 +154,16 @@ def test_one_caller_leaves_places_for_others(model: ShapeModel) -> None:
             held = asyncio.Event()
 
             async def hold() -> None:
-                async with workers.admit(CALLER):
+                async with caller(workers).admit():
                     await held.wait()
 
             for _ in range(share):
                 group.create_task(hold())
             await asyncio.sleep(0)
-            with pytest.raises(BusyError, match="for this client"):
-                await shape_file(workers, CALLER, model, ShapeRequest(None, MeshChoice.FINE, "json"))
-            other = Caller("somebody else", _stays)
-            assert (await shape_file(workers, other, model, ShapeRequest(None, MeshChoice.FINE, "json"))).content
+            with pytest.raises(RefusedError, match="for this client"):
+                await shape_file(caller(workers), model, ShapeRequest(None, MeshChoice.FINE, "json"))
+            other = caller(workers, "somebody else")
+            assert (await shape_file(other, model, ShapeRequest(None, MeshChoice.FINE, "json"))).content
             held.set()
 
     run(fill)

@@ -13,7 +13,6 @@ export const TEXTS = {
   "malformed-request": `The server could not read what the page sent. ${RELOAD}`,
   unauthorized: "The server asks for a key. Load the page again and enter the key.",
   "cross-origin": `The server refuses requests from this address. ${ADDRESS}`,
-  "no-host": `The server does not know this address. ${ADDRESS}`,
   "not-found": `The server does not know what the page asked for. ${RELOAD}`,
   "unknown-model":
     "The server does not have this model any more. Load the page again and choose another model.",
