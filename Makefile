@@ -74,11 +74,12 @@ QUICK = $(addprefix tests/,shapespace service/use_cases/test_use_cases.py test_c
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
 # Tests in which the libraries of serving take part: each call, HTTP, the formats. The rest is the same with all versions:
-# how good searches and qualities are, and what attacks do.
-SERVING = $(filter-out $(foreach name,encode_status examples fit quality untrusted_clients,%/test_$(name).py), \
+# how good searches, edits, drafts and qualities are, and what attacks do.
+SERVING = $(filter-out $(foreach name,drafts encode_status examples fit quality untrusted_clients,%/test_$(name).py), \
 	$(wildcard tests/service/calls/test_*.py tests/service/http/test_*.py)) \
 	tests/service/use_cases/test_use_cases.py tests/service/operation/test_observability.py \
-	$(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading solve/test_cholesky,tests/shapespace/$(name).py)
+	$(foreach name,files/test_formats files/test_polygon_reading files/test_gltf_reading solve/test_cholesky,tests/shapespace/$(name).py) \
+	-k 'not test_an_edit'
 
 lowest: $(VENV)-lowest/.installed ## run the server's tests with the lowest versions that pyproject.toml allows
 	PATH="$(CURDIR)/$(VENV)-lowest/bin:$$PATH" $(VENV)-lowest/bin/python -m pytest --numprocesses $(JOBS) --dist loadfile $(or $(ARGS),$(SERVING))

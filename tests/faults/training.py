@@ -9,14 +9,14 @@ import trimesh
 
 from shapespace.training.stages.run import STAGES
 from tests.training.conftest import small_config, train
-from tests.training.whole_runs.test_collection import results
+from tests.training.whole_runs.test_the_same_command import results
 
 #: With a tolerance that networks of three epochs meet.
 CONFIG = (
     small_config("bars", "bars.npz", vertices=60, modes=2, log_steps=2, samples=24, part_size=4, epochs=3)
     + "tolerance = 0.01\n"
 )
-#: Last stage of the runs. tests/training/whole_runs/test_collection.py tests kills in later stages.
+#: Last stage of the runs. tests/training/whole_runs/test_the_same_command.py tests kills in later stages.
 LAST = "export" if int(os.environ.get("FAULT_SEEDS", "1")) > 1 else "samples"
 
 

@@ -64,11 +64,11 @@ Start = Callable[..., Server]
 
 
 @contextmanager
-def starting() -> Iterator[Start]:
+def starting(kind: type[Server] = Server) -> Iterator[Start]:
     servers: list[Server] = []
 
     def start(models: Path, **settings: object) -> Server:
-        servers.append(Server(models, **settings))
+        servers.append(kind(models, **settings))
         return servers[-1]
 
     try:

@@ -65,17 +65,15 @@ def test_an_edit_reaches_what_can_be_reached(client: httpx.Client, name: str, se
     assert found["diagnostics"]["inside_bounds"]
 
 
-@pytest.mark.parametrize("far", [1, 100])
-def test_an_edit_goes_as_far_as_it_can_towards_a_target_out_of_reach(client: httpx.Client, far: float) -> None:
+def test_an_edit_goes_as_far_as_it_can_towards_a_target_out_of_reach(client: httpx.Client) -> None:
     path = "/v1/models/freaky-torus"
-    start, *others = client.post(f"{path}/sample", json={"count": 20, "seed": 4}).json()["latents"]
+    start, *others = client.post(f"{path}/sample", json={"count": 10, "seed": 4}).json()["latents"]
     shape = positions(client, start, "freaky-torus")
-    diagonal = np.linalg.norm(np.ptp(shape, axis=0))
-    place = shape[100] + far * diagonal / np.sqrt(3)
     answer = client.post(f"{path}/vertices", json={"latents": others}).raise_for_status().json()["vertices"]
-    nearest = np.linalg.norm(np.array(answer)[:, 100] - place, axis=1).min()
-    found = edit(client, place[None], [100], f"{path}/edit", latent=start)
-    assert found["residual"] < nearest
+    for far in (1, 100):
+        place = shape[100] + far * np.linalg.norm(np.ptp(shape, axis=0)) / np.sqrt(3)
+        nearest = np.linalg.norm(np.array(answer)[:, 100] - place, axis=1).min()
+        assert edit(client, place[None], [100], f"{path}/edit", latent=start)["residual"] < nearest
 
 
 def test_an_edit_leaves_a_valley_that_ends_above_its_targets(client: httpx.Client) -> None:

@@ -13,7 +13,7 @@ from shapespace.client import Client, Mesh
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.shape_model import ShapeModel, load
-from tests.service.conftest import ROOT, Server
+from tests.service.conftest import ROOT, Server, starting
 
 CODE = np.linspace(-0.4, 0.4, 20)
 
@@ -108,14 +108,8 @@ main()
 
 @pytest.fixture(scope="module")
 def hurried(models: Path) -> Iterator[httpx.Client]:
-    server = Hurried(models, deadline=300)
-    try:
-        with httpx.Client(base_url=server.url, timeout=300) as client:
-            yield client
-    finally:
-        server.stop()
-        assert server.process.stdout
-        server.process.stdout.close()
+    with starting(Hurried) as start, httpx.Client(base_url=start(models, deadline=300).url, timeout=300) as client:
+        yield client
 
 
 def test_a_late_search_answers_its_best_result_so_far(hurried: httpx.Client, figure: ShapeModel) -> None:

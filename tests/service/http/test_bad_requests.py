@@ -220,3 +220,79 @@ def test_every_fault_of_a_body_is_listed(client: httpx.Client) -> None:
 def test_a_target_may_be_a_whole_address(target: str, status: bytes, server: Server) -> None:
     answer = exchange(server, f"GET {target} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
     assert answer.split()[1] == status, answer[:500]
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", f"{MODEL}/mesh?formt=obj"),
+        ("POST", f"{MODEL}/mesh?latent=1,2,3"),
+        ("POST", f"{MODEL}/nric?mesh=coarse"),
+        ("GET", "/v1/models?page=2"),
+        ("POST", "/v2/models/small/infer?x"),
+        ("GET", "/metrics?name=a"),
+        ("HEAD", f"{MODEL}?versoin=1"),
+    ],
+)
+def test_unknown_query_parameters_are_named(client: httpx.Client, method: str, path: str) -> None:
+    answer = client.request(method, path, json={} if method == "POST" else None)
+    assert answer.status_code == 422
+    if method != "HEAD":
+        unknown = path.partition("?")[2].partition("=")[0]
+        assert f"no query parameter {unknown!r}" in answer.json()["detail"]
+
+
+def test_a_query_parameter_stands_there_once(client: httpx.Client) -> None:
+    answer = client.get(f"{MODEL}/mesh?format=obj&latent=0.1,0.7,0.4&format=ply")
+    assert answer.status_code == 422
+    assert "'format' 2 times" in answer.json()["detail"]
+
+
+def test_the_mesh_of_a_post_may_stand_in_the_query(client: httpx.Client) -> None:
+    model = "/v1/models/with-fine"
+    for path, body in (("mesh", {"latent": OK}), ("vertices", {"latents": [OK]})):
+        asked = client.post(
+            f"{model}/{path}?mesh=coarse&format=json" if path == "mesh" else f"{model}/{path}?mesh=coarse", json=body
+        )
+        told = client.post(f"{model}/{path}", params={"format": "json"}, json=body | {"mesh": "coarse"})
+        assert asked.json() == told.json()
+    answer = client.post(f"{model}/interpolations?mesh=coarse", json={"keyframes": [OK, OK], "frames": 2})
+    assert len(client.get(answer.json()["links"]["jsonl"]).text.splitlines()) == 2
+    coarse = client.get(f"{answer.json()['links']['self']}/frames/0?format=json").json()["vertices"]
+    assert len(coarse) < len(client.get(f"{model}/mesh?format=json").json()["vertices"])
+    edit = {"latent": OK, "targets": [{"vertex": len(coarse), "position": [0, 0, 0]}]}
+    assert client.post(f"{model}/edit", json=edit).status_code == 200
+    assert client.post(f"{model}/edit?mesh=coarse", json=edit).status_code == 422
+
+
+def test_any_star_matches_nothing(client: httpx.Client) -> None:
+    star = {"If-None-Match": "*"}
+    assert client.post(f"{MODEL}/mesh", json={"latent": OK}, headers=star).status_code == 200
+    assert client.get(f"{MODEL}/mesh?latent=0.1,1e30,0.4", headers=star).status_code in {200, 422}
+    assert client.get(f"{MODEL}/mesh?latent=3.4e38,0,0", headers=star).status_code == 422
+
+
+def test_answers_are_what_they_say(client: httpx.Client) -> None:
+    for path in ("/", "/page/page.css", "/v1/models", "/nothing", f"{MODEL}/mesh"):
+        assert client.get(path).headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_a_problem_does_not_repeat_what_it_was_sent(client: httpx.Client) -> None:
+    long = "x/" + "y" * 20_000
+    for answer in (
+        client.get(f"{MODEL}/mesh", headers={"Accept": long}),
+        client.get(f"{MODEL}/mesh", params={"format": long}),
+        client.get(f"{MODEL}/mesh", params={long: "1"}),
+        client.get(f"/v1/models/{'y' * 20_000}"),
+        client.post(f"{MODEL}/mesh", content=b"{}", headers={"Content-Type": long}),
+        client.post(f"{MODEL}/mesh", json={"latent": OK, long: 1}),
+        client.post(f"{MODEL}/mesh", content=b'{"latent":[1],"\\ud800":1}', headers=JSON),
+    ):
+        assert 400 <= answer.status_code < 500
+        assert len(answer.content) < 6000
+
+
+def test_an_accept_of_thousands_of_ranges_is_read_in_part(client: httpx.Client) -> None:
+    many = ",".join(["a/b;q=0.1"] * 2500)
+    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"model/obj,{many}"}).headers["Content-Type"] == "model/obj"
+    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"{many},model/obj"}).status_code == 406

@@ -8,12 +8,11 @@ import os
 import resource
 import select
 import shutil
-import signal
 import socket
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from shapespace.service.refusals import RefusedError
 from shapespace.service.use_cases.animation import Animation
 from tests.faults.serving import peak_memory
 from tests.service.conftest import ROOT, Server, Start, starting
-from tests.service.watching import SOON, eventually, samples, value
+from tests.service.watching import eventually, samples, value
 from tests.service.wire import connect, exchange, rest, status_and_problem
 
 MIB = 2**20
@@ -444,82 +443,6 @@ def test_the_costliest_id_costs_little() -> None:
 # The rest
 
 
-@pytest.mark.parametrize(
-    ("method", "path"),
-    [
-        ("GET", f"{MODEL}/mesh?formt=obj"),
-        ("POST", f"{MODEL}/mesh?latent=1,2,3"),
-        ("POST", f"{MODEL}/nric?mesh=coarse"),
-        ("GET", "/v1/models?page=2"),
-        ("POST", "/v2/models/small/infer?x"),
-        ("GET", "/metrics?name=a"),
-        ("HEAD", f"{MODEL}?versoin=1"),
-    ],
-)
-def test_unknown_query_parameters_are_named(client: httpx.Client, method: str, path: str) -> None:
-    answer = client.request(method, path, json={} if method == "POST" else None)
-    assert answer.status_code == 422
-    if method != "HEAD":
-        unknown = path.partition("?")[2].partition("=")[0]
-        assert f"no query parameter {unknown!r}" in answer.json()["detail"]
-
-
-def test_a_query_parameter_stands_there_once(client: httpx.Client) -> None:
-    answer = client.get(f"{MODEL}/mesh?format=obj&latent=0.1,0.7,0.4&format=ply")
-    assert answer.status_code == 422
-    assert "'format' 2 times" in answer.json()["detail"]
-
-
-def test_the_mesh_of_a_post_may_stand_in_the_query(client: httpx.Client) -> None:
-    model = "/v1/models/with-fine"
-    for path, body in (("mesh", {"latent": CODE}), ("vertices", {"latents": [CODE]})):
-        asked = client.post(
-            f"{model}/{path}?mesh=coarse&format=json" if path == "mesh" else f"{model}/{path}?mesh=coarse", json=body
-        )
-        told = client.post(f"{model}/{path}", params={"format": "json"}, json=body | {"mesh": "coarse"})
-        assert asked.json() == told.json()
-    answer = client.post(f"{model}/interpolations?mesh=coarse", json={"keyframes": [CODE, CODE], "frames": 2})
-    assert len(client.get(answer.json()["links"]["jsonl"]).text.splitlines()) == 2
-    coarse = client.get(f"{answer.json()['links']['self']}/frames/0?format=json").json()["vertices"]
-    assert len(coarse) < len(client.get(f"{model}/mesh?format=json").json()["vertices"])
-    edit = {"latent": CODE, "targets": [{"vertex": len(coarse), "position": [0, 0, 0]}]}
-    assert client.post(f"{model}/edit", json=edit).status_code == 200
-    assert client.post(f"{model}/edit?mesh=coarse", json=edit).status_code == 422
-
-
-def test_any_star_matches_nothing(client: httpx.Client) -> None:
-    star = {"If-None-Match": "*"}
-    assert client.post(f"{MODEL}/mesh", json={"latent": CODE}, headers=star).status_code == 200
-    assert client.get(f"{MODEL}/mesh?latent=0.1,1e30,0.4", headers=star).status_code in {200, 422}
-    assert client.get(f"{MODEL}/mesh?latent=3.4e38,0,0", headers=star).status_code == 422
-
-
-def test_answers_are_what_they_say(client: httpx.Client) -> None:
-    for path in ("/", "/page/page.css", "/v1/models", "/nothing", f"{MODEL}/mesh"):
-        assert client.get(path).headers["X-Content-Type-Options"] == "nosniff"
-
-
-def test_a_problem_does_not_repeat_what_it_was_sent(client: httpx.Client) -> None:
-    long = "x/" + "y" * 20_000
-    for answer in (
-        client.get(f"{MODEL}/mesh", headers={"Accept": long}),
-        client.get(f"{MODEL}/mesh", params={"format": long}),
-        client.get(f"{MODEL}/mesh", params={long: "1"}),
-        client.get(f"/v1/models/{'y' * 20_000}"),
-        client.post(f"{MODEL}/mesh", content=b"{}", headers={"Content-Type": long}),
-        client.post(f"{MODEL}/mesh", json={"latent": CODE, long: 1}),
-        client.post(f"{MODEL}/mesh", content=b'{"latent":[1],"\\ud800":1}', headers=JSON),
-    ):
-        assert 400 <= answer.status_code < 500
-        assert len(answer.content) < 6000
-
-
-def test_an_accept_of_thousands_of_ranges_is_read_in_part(client: httpx.Client) -> None:
-    many = ",".join(["a/b;q=0.1"] * 2500)
-    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"model/obj,{many}"}).headers["Content-Type"] == "model/obj"
-    assert client.get(f"{MODEL}/mesh", headers={"Accept": f"{many},model/obj"}).status_code == 406
-
-
 def test_a_head_is_logged_as_one(quiet: Server) -> None:
     assert httpx.head(f"{quiet.url}/v1/models").status_code == 200
     eventually(lambda: "HEAD /v1/models 200" in quiet.log)
@@ -545,38 +468,3 @@ def test_an_edit_ends_when_its_client_leaves(figure_models: Path, start: Start) 
     log = server.stop()
     assert "/v1/models/figure/edit 499" in log
     assert "Traceback" not in log
-
-
-@pytest.mark.parametrize(
-    "busy", ["shapes", *(pytest.param(busy, marks=pytest.mark.long) for busy in ("streams", "nothing"))]
-)
-def test_sigterm_ends_it_soon_whatever_it_is_doing(small_models: Path, start: Start, busy: str) -> None:
-    server = start(small_models, workers=2, max_codes=10_000, max_frames=20_000)
-    calls: list[Callable[[], object]] = []
-    if busy == "shapes":
-        body = {"latents": [CODE] * 10_000}
-        calls = [lambda: httpx.post(f"{server.url}{MODEL}/vertices", json=body, timeout=60)] * 4
-    elif busy == "streams":
-        path = {"keyframes": [CODE, [0, 0, 0]], "frames": 20_000}
-        answer = httpx.post(f"{server.url}{MODEL}/interpolations", json=path)
-        link = server.url + answer.json()["links"]["jsonl"]
-        calls = [lambda: httpx.get(link, timeout=60)] * 4
-    with ThreadPoolExecutor(4) as pool:
-        asked = [pool.submit(call) for call in calls]
-        if calls:
-            at_work = {"shapes": "shapespace_admitted", "streams": "shapespace_streams"}[busy]
-            with httpx.Client(base_url=server.url) as client:
-                eventually(lambda: value(samples(client), at_work) == len(calls))
-        began = time.monotonic()
-        server.process.send_signal(signal.SIGTERM)
-        assert server.process.wait(60) == 0
-        assert time.monotonic() - began < SOON, "without a drain"
-        for call in asked:
-            answer = call.result()
-            assert isinstance(answer, httpx.Response)
-            if busy == "shapes":
-                assert (answer.status_code, answer.json()["type"]) == (503, "urn:shapespace:problem:not-ready")
-                assert "Retry-After" in answer.headers
-            else:
-                assert json.loads(answer.text.splitlines()[-1])["problem"]["status"] == 503
-    assert "Traceback" not in server.log

@@ -20,9 +20,10 @@ import httpx
 import pytest
 
 from tests.service.conftest import ROOT, Server, Start
-from tests.service.watching import admitted, eventually
+from tests.service.watching import SOON, admitted, eventually, samples, value
 
-MESH = "/v1/models/small/mesh"
+MODEL = "/v1/models/small"
+MESH = f"{MODEL}/mesh"
 
 
 class Patient(Server):
@@ -181,4 +182,39 @@ def test_an_interrupt_ends_it_at_once_and_answers_what_runs(small_models: Path, 
         assert answer.result().status_code == 503
         assert answer.result().json()["type"] == "urn:shapespace:problem:not-ready"
         assert server.process.wait(60) == 0
+    assert "Traceback" not in server.log
+
+
+@pytest.mark.parametrize(
+    "busy", ["shapes", *(pytest.param(busy, marks=pytest.mark.long) for busy in ("streams", "nothing"))]
+)
+def test_sigterm_ends_it_soon_whatever_it_is_doing(small_models: Path, start: Start, busy: str) -> None:
+    server = start(small_models, workers=2, max_codes=10_000, max_frames=20_000)
+    calls: list[Callable[[], object]] = []
+    if busy == "shapes":
+        body = {"latents": [[0.1, 0.7, 0.4]] * 10_000}
+        calls = [lambda: httpx.post(f"{server.url}{MODEL}/vertices", json=body, timeout=60)] * 4
+    elif busy == "streams":
+        path = {"keyframes": [[0.1, 0.7, 0.4], [0, 0, 0]], "frames": 20_000}
+        answer = httpx.post(f"{server.url}{MODEL}/interpolations", json=path)
+        link = server.url + answer.json()["links"]["jsonl"]
+        calls = [lambda: httpx.get(link, timeout=60)] * 4
+    with ThreadPoolExecutor(4) as pool:
+        asked = [pool.submit(call) for call in calls]
+        if calls:
+            at_work = {"shapes": "shapespace_admitted", "streams": "shapespace_streams"}[busy]
+            with httpx.Client(base_url=server.url) as client:
+                eventually(lambda: value(samples(client), at_work) == len(calls))
+        began = time.monotonic()
+        server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(60) == 0
+        assert time.monotonic() - began < SOON, "without a drain"
+        for call in asked:
+            answer = call.result()
+            assert isinstance(answer, httpx.Response)
+            if busy == "shapes":
+                assert (answer.status_code, answer.json()["type"]) == (503, "urn:shapespace:problem:not-ready")
+                assert "Retry-After" in answer.headers
+            else:
+                assert json.loads(answer.text.splitlines()[-1])["problem"]["status"] == 503
     assert "Traceback" not in server.log

@@ -15,7 +15,7 @@ from shapespace.training.collection.faults import IngestError
 from shapespace.training.collection.generators import figure
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
-from tests.training.whole_runs.test_collection import bars
+from tests.training.whole_runs.conftest import bars
 
 SHAPES, FACES = bars(12)
 ODD = 4

@@ -28,7 +28,7 @@ SPHERE, SURFACE = with_parts(ball())
 EYE, BAR, NAIL = (np.unique(SURFACE.corners[np.repeat(SURFACE.objects.of == k, SURFACE.sizes)]) for k in range(3))
 
 
-def bars(count: int = 6) -> tuple[np.ndarray, np.ndarray]:
+def bars(count: int = 5) -> tuple[np.ndarray, np.ndarray]:
     """A thick bar in several poses, far from the origin and in large units, whose ends bend independently.
 
     The files have textured quads, with an eye and a nail as separate parts; returned are their triangles.

@@ -1,18 +1,11 @@
-"""From a folder of meshes to a served shape: the real command, killed in every stage, and a real server."""
+"""From a folder of meshes to a served shape: the real command, and a real server."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
-import shutil
-import signal
-import subprocess
-import sys
-import time
 import zipfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -20,20 +13,13 @@ import numpy as np
 import pytest
 import trimesh
 from pxr import Usd, UsdGeom
-from safetensors.numpy import load_file
 
 from benchmarks.studies import SeedLearner, ShareLearner
-from shapespace.bundle.geometry import Geometry
-from shapespace.bundle.reader import read_bundle
 from shapespace.files.attributes.reading import read_attributes
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.__main__ import main
-from shapespace.training.learning import ExportError
-from shapespace.training.learning.export import export
-from shapespace.training.runs.config import load, parse
-from shapespace.training.runs.directory import RunDirectory
+from shapespace.training.runs.config import load
 from shapespace.training.runs.sampling import read
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.run import STAGES
@@ -41,8 +27,7 @@ from shapespace.training.stages.stage import Run
 from tests.service.conftest import starting
 from tests.service.glb import GLB
 from tests.surfaces import corner_uv, parse_obj, same_corners
-from tests.training.conftest import command
-from tests.training.whole_runs.conftest import BAR, CONFIG, EYE, NAIL, SURFACE, bars
+from tests.training.whole_runs.conftest import BAR, EYE, NAIL, SURFACE, bars
 
 
 def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
@@ -61,7 +46,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     with np.load(run / "modes.npz") as modes:
         assert modes["nric"].shape == (3, 2 * len(mesh.edges))
         assert modes["vertices"].shape == (3, *mesh.vertices.shape)
-        assert modes["coefficients"].shape == (6, 3)
+        assert modes["coefficients"].shape == (5, 3)
         assert (modes["lower"] < 0).all()
         assert (modes["upper"] > 0).all()
     groups = json.loads((run / "factors.json").read_text())
@@ -89,7 +74,7 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     unseen, encoded = (json.loads((run / f"{name}.json").read_text()) for name in ("generalisation", "encoded"))
     assert unseen.pop("made_by")["version"]
     assert figures["generalisation"] == unseen
-    assert (unseen["held_out"], unseen["counts"]) == (6, [2, 3])
+    assert (unseen["held_out"], unseen["counts"]) == (5, [2, 3])
     for kind in ("modes", "components", "remembering_components", "linear_nric"):
         fewer, more = (each["mean"] for each in unseen[kind])
         assert 0 < more < fewer < 0.1
@@ -97,14 +82,14 @@ def test_a_run_leaves_what_the_contract_promises(run: Path) -> None:
     assert unseen["not_stuck"]["modes"] == unseen["modes"][-1]
     parts = [np.load(path) for path in sorted((run / "samples").glob("part-*.npz"))]
     random = np.concatenate([part["vertices"][part["status"] == "done"] for part in parts])[:200]
-    given = np.load(run / "shapes.npz")["vertices"][:6]  # mirror images come after
+    given = np.load(run / "shapes.npz")["vertices"][:5]  # mirror images come after
     size = np.linalg.norm(np.ptp(np.load(run / "reference.npz")["vertices"], axis=0))
     away = [min(np.linalg.norm(align(x, y) - y, axis=1).mean() for y in given) for x in random]
     assert figures["specificity"]["modes"] == pytest.approx(np.mean(away) / size, rel=1e-4)
     assert 0 < figures["specificity"]["components"] < 0.2
     assert 0.5 < figures["compactness"]["modes"] <= 1
     assert 0.5 < figures["compactness"]["components"] <= 1
-    assert (encoded["shapes"], encoded["outside"], encoded["mesh"]) == (6, [], "fine")
+    assert (encoded["shapes"], encoded["outside"], encoded["mesh"]) == (5, [], "fine")
     assert 0 < encoded["mean"] < encoded["p95"] < 0.02
     # What modes and these hasty networks miss is remembered; the fine mesh is still carried along.
     assert encoded["remembered"]
@@ -358,170 +343,3 @@ def test_the_server_has_the_exponentials_that_the_networks_learned_from(url: str
     answer = httpx.post(f"{url}/v1/models/bars/vertices", json=body, timeout=60).json()
     for exact, shape in zip(answer["exact"], shapes, strict=True):
         np.testing.assert_allclose(exact, align(shape, np.array(exact)), atol=0.01)
-
-
-def again(copy: Run, monkeypatch: pytest.MonkeyPatch, old: str = "", new: str = "", until: str = "export") -> None:
-    """The same command on a copy of the run, with a change of the configuration."""
-    config = copy.directory.folder.parent / "bars.toml"
-    assert copy.source.count(old or "[export]") == 1
-    config.write_text(copy.source.replace(old, new) if old else copy.source)
-    folder = copy.directory.folder
-    arguments = ["run", str(config), "--out", str(folder), "--models", str(copy.models), "--until", until]
-    monkeypatch.setattr(sys, "argv", ["shapespace-train", *arguments])
-    assert main() == 0
-
-
-def seconds(run: Run) -> dict[str, float]:
-    return {name: run.directory.stamp(name).read().get("seconds", 0) for name in STAGES}
-
-
-def test_the_same_command_again_does_nothing_and_a_changed_setting_only_its_stages(
-    copy: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = seconds(copy)
-    again(copy, monkeypatch)
-    assert seconds(copy) == before
-    again(copy, monkeypatch, "reconstructions = 4", "reconstructions = 3", "evaluation")
-    after = seconds(copy)
-    assert {name for name in STAGES if before[name] != after[name]} == {"evaluation", "export"}
-    assert after["evaluation"] > after["export"] == 0
-
-
-def test_modes_that_are_lost_are_found_again_and_put_in_the_order_of_the_factors(
-    copy: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    directory = copy.directory
-    paths = [directory.mean.path, directory.modes.path, directory.modes_by_strength.path]
-    before, times = [path.read_bytes() for path in paths], seconds(copy)
-    paths[1].unlink()
-    again(copy, monkeypatch, until="factors")
-    assert seconds(copy)["modes"] == times["modes"], "the factors alone write them again"
-    for path in paths:
-        path.unlink()
-    again(copy, monkeypatch, until="evaluation")
-    assert [path.read_bytes() for path in paths] == before
-    assert seconds(copy)["samples"] == times["samples"]
-
-
-@pytest.mark.long
-def test_a_description_changes_the_bundle_alone(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, name = seconds(copy), copy.directory.factors.read()["names"][0]
-    described = f'"Another description."\nnames = {{ "{name}" = "the end" }}'
-    again(copy, monkeypatch, '"A run for the tests."', described)
-    after = seconds(copy)
-    assert {name for name in STAGES if before[name] != after[name]} == {"export"}
-    manifest = read_bundle(copy.bundle).manifest
-    assert manifest.description == "Another description."
-    assert manifest.factors[0].name == "the end"
-    assert manifest.latent_names[0].startswith("the end")
-
-
-def test_more_samples_are_drawn_beside_those_that_are_there(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = sorted(copy.directory.samples.glob("part-*.npz")) + sorted(copy.directory.samples.glob("factor-*/*.npz"))
-    before = {path: path.stat().st_mtime_ns for path in files}
-    again(copy, monkeypatch, "\ncount = 60", "\ncount = 70", "samples")
-    assert not any("seconds" in copy.directory.stamp(name).read() for name in list(STAGES)[-3:])
-    shown = ("evaluation.json", "gallery.npz", "report.html", "networks/histories.json")
-    assert not any((copy.directory.folder / name).exists() for name in shown), "figures of the former samples"
-    drawn = read(copy.directory.samples).index
-    assert len(drawn[drawn >= 0]) == 70
-    assert {path: path.stat().st_mtime_ns for path in files} == before
-    copy.source = copy.source.replace("steps = 4\npart", "steps = 2\npart")
-    again(copy, monkeypatch, "\ncount = 60", "\ncount = 10", "samples")
-    assert all(path.stat().st_mtime_ns != before[path] for path in files if path.exists())
-
-
-def test_without_baselines_nothing_is_trained_for_comparison(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Other networks follow, so this stage would be done again too, though it has nothing to do with them.
-    monkeypatch.setitem(STAGES, "generalisation", replace(STAGES["generalisation"], run=lambda run: None))
-    again(copy, monkeypatch, "baselines = true\n", "", "evaluation")
-    kinds = {path.stem.rpartition("-")[0] for path in copy.directory.networks()}
-    assert (
-        kinds == {"combiner", "factor-0", "factor-1"} == {k.rpartition("-")[0] for k in copy.directory.histories.read()}
-    )
-    found = copy.directory.evaluation.read()
-    assert found["r2"].keys() == {"composite", "kernel", "affine", "affine of learned factors", "limit"}
-    assert found["fresh"]["r2"].keys() == {"composite", "kernel"}
-    assert copy.directory.report.exists()
-
-
-def test_networks_that_are_not_needed_any_more_are_removed(
-    run: Path, copy: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    again(copy, monkeypatch, "[monolithic]\nhidden = [16]", "[monolithic]\nhidden = [8]", "networks")
-    before, after = ({path.stem for path in directory.networks()} for directory in (RunDirectory(run), copy.directory))
-    changed = sorted(name.rpartition("-")[0] for name in before ^ after)
-    assert changed == ["monolithic"] * 2 + ["monolithic-combiner"] * 2
-    assert len(before) == len(after)
-    assert copy.directory.histories.read().keys() == after
-
-
-@pytest.mark.parametrize(
-    ("more", "says"),
-    [
-        pytest.param("tolerance = 1e-12\n", "differ by", marks=pytest.mark.long),
-        ('names = { nose = "a" }\n', "'nose', which is neither"),
-    ],
-)
-def test_export_refuses_networks_that_onnx_computes_otherwise_and_a_name_for_nothing(
-    more: str, says: str, run: Path, tmp_path: Path
-) -> None:
-    opened = Run(run, *load(run / "config.toml"), tmp_path)
-    geometry = Geometry(reference=opened.collection.reference)
-    with pytest.raises(ExportError, match=says):
-        export(learner_of(opened).main(), opened.collection, parse(CONFIG + more, "more"), {}, "", tmp_path, geometry)
-    assert not opened.bundle.exists()
-
-
-def results(run: Path) -> dict[str, object]:
-    """Contents of all files of a run, except times, logs and the report."""
-    found: dict[str, object] = {}
-    for path in sorted(run.rglob("*")):
-        name = str(path.relative_to(run))
-        if path.suffix == ".npz":
-            with np.load(path) as file:
-                found |= {f"{name}/{key}": file[key].tobytes() for key in file}
-        elif path.suffix == ".safetensors":
-            found |= {f"{name}/{key}": value.tobytes() for key, value in load_file(path).items()}
-        elif path.suffix == ".onnx":
-            found[name] = path.read_bytes()
-        elif path == run / "evaluation.json":
-            found[name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "times"}
-    return found
-
-
-@pytest.mark.long
-def test_a_run_killed_in_every_stage_ends_as_one_that_nobody_disturbed(run: Path, folder: Path, tmp_path: Path) -> None:
-    again, rng = tmp_path / "again", np.random.default_rng(0)
-    log = again / "log.jsonl"
-    for stage in STAGES:
-        process = subprocess.Popen(
-            command(folder / "bars.toml", again), stdout=subprocess.DEVNULL, start_new_session=True
-        )
-        while f'"begin", "stage": "{stage}"' not in (log.read_text() if log.exists() else ""):
-            assert process.poll() is None, "the run ended before it could be killed"
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 0.5))
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    subprocess.run(command(folder / "bars.toml", again), check=True, capture_output=True)
-    one, other = results(run), results(again)
-    assert one.keys() == other.keys()
-    assert [name for name in one if one[name] != other[name]] == []
-
-
-@pytest.mark.long
-def test_init_writes_a_configuration_that_the_command_takes(folder: Path, tmp_path: Path) -> None:
-    few, out = tmp_path / "few", tmp_path / "mine.toml"
-    # Each mesh is held out in turn, so that the time grows with their square.
-    shutil.copytree(folder / "meshes", few, ignore=shutil.ignore_patterns("bar5.*"))
-    shapespace = [sys.executable, "-m", "shapespace.training"]
-    subprocess.run([*shapespace, "init", str(few), "--out", str(out)], check=True, capture_output=True)
-    text, default = out.read_text(), "# coarse_vertices = 1000"
-    assert default in text
-    out.write_text(text.replace(default, "coarse_vertices = 120"))
-    run = command(out, tmp_path / "run", "--until", "mean")
-    done = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    with np.load(tmp_path / "run" / "mean.npz") as mean:
-        assert str(mean["status"]) == "converged"

@@ -29,7 +29,7 @@ from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
 from tests.faults.training import CONFIG, bars
 from tests.training.conftest import TINY, Said
-from tests.training.whole_runs.test_collection import results
+from tests.training.whole_runs.test_the_same_command import results
 
 SHAPES, FACES = bars(6)
 
