@@ -75,7 +75,7 @@ TESTS = {
         {"SEEDS": "20"},
     ),
     "busy": LongTest(
-        "run the whole suite RUNS times beside four processes that keep the processors busy",
+        "run the whole suite RUNS times, each time beside at least four busy processes",
         ("tests",),
         ("python -m tests.long.busy {RUNS}",),
         {"RUNS": "5"},

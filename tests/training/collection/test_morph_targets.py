@@ -101,7 +101,7 @@ def test_a_run_reads_a_file_with_buffers_beside_it(tmp_path: Path, said: Said) -
 def test_too_few_targets_are_told(targets: int, tmp_path: Path) -> None:
     path = face_file(tmp_path / "face" / "face.glb", targets)
     for data in (path, path.parent):
-        with pytest.raises(IngestError, match=rf"face\.glb: has {1 + targets} shapes?; .* each morph target that moves"):
+        with pytest.raises(IngestError, match=rf"face\.glb: has {1 + targets} shapes?; .* each morph target"):
             read_collection(data)
 
 
