@@ -41,8 +41,8 @@ licence = "CC0-1.0"
 "upper right bends" = "thumb"
 ```
 
-Brackets have the default, then other choices and limits. A setting with only a type, such as *path*, has no default.
-The run refuses unknown settings. The [glossary](glossary.md) explains the words.
+Brackets have the default, then other choices and limits. A setting with only a type has no fixed default:
+its text says what holds without it. The run refuses unknown settings. The [glossary](glossary.md) explains the words.
 """
 RESEARCH = """\
 ## For research: kinds of networks

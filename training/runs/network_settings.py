@@ -210,8 +210,8 @@ class PaperSettings(SettingsTable):
 
 class AutoSettings(SettingsTable):
     """``kernel`` for most collections. If codes move something over the surface, also ``field`` for ``freaky-torus``,
-    otherwise ``convolutions``. The run takes this second kind if its error on held-out codes is at least a tenth
-    smaller.
+    otherwise ``convolutions``. The run takes this second kind if its squared error on validation codes is at
+    least a tenth smaller.
     """
 
     kind: Literal["auto"] = "auto"

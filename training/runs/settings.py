@@ -110,13 +110,13 @@ class ModeSettings(SettingsTable):
     """Norm in which modes approximate shapes. ``vertices``: distances, weighted by area. ``shell``: the metric of the
     shell space, with much weight on wrinkles. ``mixed``: ``vertices`` plus a tenth of ``shell``."""
     sparsity: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] = "auto"
-    """Weight λ of sparsity, as a share of the weight at which modes vanish. Larger values make modes more local.
+    """Weight s of sparsity, as a share of the weight at which all modes vanish. Larger values make modes more local.
     ``auto`` takes the largest that raises the error of held-out shapes by at most 2 %, or else 0."""
     log_steps: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number K of [time steps](glossary.md#time-steps) of logarithms. ``auto`` takes 8 (16 with the paper's first
     step), or 1 if held-out shapes get no worse and at most a tenth of random shapes fold."""
     max_iterations: int = Field(200, ge=1)
-    """Most iterations over all modes."""
+    """Most iterations of the search for sparse modes. A warning tells if they were too few."""
 
 
 class FactorSettings(SettingsTable):

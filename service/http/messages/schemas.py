@@ -39,9 +39,9 @@ QualityField = Annotated[
     Quality,
     Field(
         description="`auto` stops Gauss–Newton where more steps would not bring the shape closer to the exact one: it "
-        "is at most 1.1 times as far away as `full`. `full` solves to convergence. `draft` leaves out Gauss–Newton if "
-        "the first guess is accurate enough. The card's `auto_error` and `draft_error` are the distances from `full`. "
-        "`Shape-Diagnostics.quality` says which quality was answered."
+        "is on average at most 1.1 times as far away as `full`. `full` solves to convergence. `draft` leaves out "
+        "Gauss–Newton if the first guess is accurate enough. The card's `auto_error` and `draft_error` are the "
+        "distances from `full`. `Shape-Diagnostics.quality` says which quality was answered."
     ),
 ]
 ExamplesField = Annotated[
