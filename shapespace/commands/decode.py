@@ -137,6 +137,9 @@ def _kind_of(out: Path, format: str | None) -> tuple[str, bool]:
     if is_folder and out.exists() and not out.is_dir():
         raise UnusableOutputError(f"{out} is a file; name a folder, or a file with an extension such as .glb")
     if format:
+        ending = out.suffix.lower()
+        if not is_folder and ending != f".{format}" and ending[1:] in FORMATS:
+            raise UnusableOutputError(f"{out} ends in {ending}, but --format is {format}; leave one of them out")
         return require_writable(format), is_folder
     return ("glb" if is_folder else format_of(out)), is_folder
 

@@ -142,7 +142,7 @@ class ShapeModel:
         code: ArrayLike,
         inside_bounds: bool = True,
         mesh: MeshName = "fine",
-        deadline: Deadline | None = None,
+        deadline: Deadline | float | None = None,
         quality: QualityName = "auto",
         examples: bool = True,
     ) -> Shape:
@@ -152,7 +152,7 @@ class ShapeModel:
             code: code from ``model.latents.codes`` or ``model.sample``.
             inside_bounds: whether the code lies inside the bounds, for the diagnostics.
             mesh: "fine" or "coarse".
-            deadline: time limit after which Gauss–Newton stops with Status.DEADLINE.
+            deadline: time limit, or seconds, after which Gauss–Newton stops with Status.DEADLINE.
             quality: "auto"; "full" for the converged solution; or "draft", which leaves Gauss–Newton out. See Quality.
             examples: False leaves out what the model remembers of training shapes.
 
@@ -167,7 +167,9 @@ class ShapeModel:
         ((4601, 3), <Status.CONVERGED: 'converged'>)
         """
         given = np.asarray(code, dtype=np.float32)
-        return self.decoder.shape(given, inside_bounds, MeshChoice(mesh), deadline, Quality(quality), examples)
+        return self.decoder.shape(
+            given, inside_bounds, MeshChoice(mesh), Deadline.of(deadline), Quality(quality), examples
+        )
 
     @OneBlasThread()
     def decode(
@@ -284,7 +286,7 @@ class ShapeModel:
         mesh: MeshLike | Matched,
         options: EncodeOptions | None = None,
         *,
-        deadline: Deadline | None = None,
+        deadline: Deadline | float | None = None,
         **changes: Any,
     ) -> Encoded:
         """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
@@ -293,7 +295,7 @@ class ShapeModel:
             mesh: the fine or the coarse mesh of the model in the units of the training meshes: vertices (V, 3) in the
                 model's order, a mesh, or the path of an OBJ, PLY, STL, OFF, glTF or NPZ file.
             options: options of the search.
-            deadline: time limit after which the status is Status.DEADLINE.
+            deadline: time limit, or seconds, after which the status is Status.DEADLINE.
             changes: single options by name, for example ``objective="nric"``; see EncodeOptions.
 
         Raises:
@@ -312,7 +314,7 @@ class ShapeModel:
         (True, <MeshChoice.FINE: 'fine'>, (4601, 3))
         """
         given = mesh if isinstance(mesh, Matched) else matched(self.decoder, mesh)
-        return self._encoder(given, EncodeOptions.of(options, changes), deadline)
+        return self._encoder(given, EncodeOptions.of(options, changes), Deadline.of(deadline))
 
     @OneBlasThread()
     def edit(
@@ -321,7 +323,7 @@ class ShapeModel:
         targets: Mapping[int, ArrayLike] | Sequence[Target],
         options: EditOptions | None = None,
         *,
-        deadline: Deadline | None = None,
+        deadline: Deadline | float | None = None,
         **changes: Any,
     ) -> Edited:
         """Find the code inside the bounds whose shape comes closest to having some vertices at given positions.
@@ -334,7 +336,7 @@ class ShapeModel:
             targets: at least one target: positions (3,) by vertex, or Targets; in the frame of the shape that
                 ``decode`` returns for ``code``.
             options: options of the edit.
-            deadline: time limit after which the status is Status.DEADLINE.
+            deadline: time limit, or seconds, after which the status is Status.DEADLINE.
             changes: single options by name, for example ``prior=1e-3``; see EditOptions.
 
         Raises:
@@ -352,7 +354,7 @@ class ShapeModel:
         """
         chosen = EditOptions.of(options, changes)
         start, _ = self.latents.code(np.asarray(code, dtype=np.float64).tolist(), Bounds.CLAMP)
-        return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, deadline)
+        return edited(self.decoder, start, listed_targets(targets, chosen.sigma), chosen, Deadline.of(deadline))
 
     @OneBlasThread()
     def fit_scan(
@@ -360,7 +362,7 @@ class ShapeModel:
         scan: ScanLike,
         options: FitOptions | None = None,
         *,
-        deadline: Deadline | None = None,
+        deadline: Deadline | float | None = None,
         progress: Callable[[float], None] | None = None,
         **changes: Any,
     ) -> Fitted:
@@ -370,7 +372,7 @@ class ShapeModel:
             scan: points (N, 3); points and faces (F, 3); a mesh; or the path of an OBJ, PLY, STL, OFF, glTF, NPZ or XYZ
                 file. In the units of the training meshes unless the scale is free.
             options: options of the fit.
-            deadline: time limit after which the status is "deadline".
+            deadline: time limit, or seconds, after which the status is "deadline".
             progress: called from time to time with the share of the work that is done.
             changes: single options by name, for example ``partial=True``; see FitOptions.
 
@@ -394,7 +396,7 @@ class ShapeModel:
         >>> bool(np.abs(there - model.decode(code) - [3, 0, 1]).max() < 0.01)
         True
         """
-        return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), deadline, progress)
+        return self._fitter(*points_and_faces(scan), FitOptions.of(options, changes), Deadline.of(deadline), progress)
 
     fit = fit_scan  # The old name remains for one release.
 

@@ -15,6 +15,11 @@ class Deadline:
         self.time = time.monotonic() + seconds  # on the clock of ``time.monotonic``
         self._called_off = False
 
+    @classmethod
+    def of(cls, limit: Deadline | float | None) -> Deadline | None:
+        """Return a limit as a deadline; a number is in seconds from now."""
+        return limit if limit is None or isinstance(limit, Deadline) else Deadline(limit)
+
     @property
     def passed(self) -> bool:
         """Whether the work should stop."""

@@ -205,6 +205,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("decode small --random 2 --out -", 1, "standard output is one file; for several shapes, name a folder"),
         ("decode small --out x.xyz", 1, "there is no format 'xyz'; choose among glb, gltf, obj"),
         ("decode small --out models/small/1/README.md", 1, "there is no format 'md'"),
+        ("decode small --format obj --out x.glb", 1, "x.glb ends in .glb, but --format is obj"),
         ("decode small --out plain", 1, "plain is a file; name a folder, or a file with an extension"),
         ("page small --out site", 1, "small has no decoder.onnx, which computes shapes in the browser"),
         ("page small --out plain", 1, "plain is a file; name a folder"),

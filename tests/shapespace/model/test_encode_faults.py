@@ -62,7 +62,7 @@ def test_another_size_is_named_and_noise_and_a_stretched_shape_are_not(
 def test_a_search_leaves_time_to_complete_its_result(figure: ShapeModel, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shapespace.solve.deadline.COMPLETING_SHARE", 1)
     monkeypatch.setattr("shapespace.solve.deadline.COMPLETING_SECONDS", 1e9)
-    found = figure.encode(figure.vertices, deadline=Deadline(600))
+    found = figure.encode(figure.vertices, deadline=600)
     assert (found.status, found.cause) == (Status.DEADLINE, None)
     assert found.shape.diagnostics.status is Status.CONVERGED
 
