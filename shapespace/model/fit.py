@@ -377,7 +377,7 @@ class _Fit:
             if mirrored is not None and mirrored < SETTINGS.mirrored:
                 reason += " Its mirror image fits much better: change the sign of one coordinate."
             elif not self.constraints.partial:
-                reason += " Set partial=true if it shows a part only, or give three landmarks."
+                reason += " If it shows a part only, set the option `partial`. Otherwise give three landmarks."
         elif rival is not None:
             status = FitStatus.AMBIGUOUS
             apart = self._apart(rival, state)
