@@ -131,16 +131,18 @@ def test_a_validation_that_never_ends_or_dies_keeps_no_other_bundle_out(
     hostile.hostile(tmp_path, "a", hostile.doubles)
     write_bundle(tmp_path, "b")
     monkeypatch.setattr(validation, "SECONDS", 8)
+    monkeypatch.setattr(validation, "VALIDATE", "tests.service.tasks:crash_where_told")
     repository = ModelRepository(tmp_path)
     assert [model.manifest.name for model in repository] == ["b"]
     assert messages(caplog) == ["bundle a/1 is not served: loaded in a separate process, it took longer than 8 s"]
 
     write_bundle(tmp_path, "c")
-    monkeypatch.setattr(validation, "VALIDATE", "tests.service.tasks:crash_at_c")
+    told = tmp_path / "c" / "crash"
+    told.touch()
     assert repository.reload() == Changes(refused=["a/1", "c/1"])
     assert messages(caplog)[-1] == "bundle c/1 is not served: loaded in a separate process, it died of SIGSEGV"
 
-    monkeypatch.undo()
+    told.unlink()
     shutil.rmtree(tmp_path / "a")
     assert repository.reload() == Changes(loaded=["c/1"])
 
