@@ -12,7 +12,7 @@ Find codes of meshes with ``encode``, of edited vertices with ``edit``, and of s
 name or as one object. A deadline ends a search early, and ``status`` says how the search ended:
 
 >>> options = shapespace.EncodeOptions(objective="nric", samples=2)
->>> found = model.encode(positions[0], options, deadline=600)
+>>> found = model.encode(positions[0], options, deadline=shapespace.Deadline(seconds=600))
 >>> found.status is shapespace.Status.CONVERGED, found.samples.shape
 (True, (2, 20))
 
