@@ -10,6 +10,7 @@ system.
 from __future__ import annotations
 
 import hashlib
+import logging
 import operator
 import pickle
 import sys
@@ -108,7 +109,9 @@ def _in_processes(
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    warnings.filterwarnings("ignore", message=r"\d+ tasks (which were|have been)")  # of a stage that an error ends
+    # What joblib says when an error or a signal ends a stage, beside the reason that the command says.
+    warnings.filterwarnings("ignore", message=r"\d+ tasks (which were|have been)")
+    logging.getLogger("concurrent.futures").setLevel(logging.CRITICAL)
     left = dict(enumerate(items))
     for deaths in range(1 + RETRIES):
         # One BLAS thread from the start, for libraries that look at the environment when they are loaded.
