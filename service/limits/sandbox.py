@@ -115,7 +115,7 @@ class Sandbox:
             if child is None or child.dead:
                 self._end(child)
                 child = self._start()
-            reply, arrays = child.call(facts or {}, body or Pieces(), deadline, memory, most)
+            outcome, arrays, full = child.call(facts or {}, body or Pieces(), deadline, memory, most)
         except BaseException as error:
             self._end(child)
             self._free.put(None)
@@ -123,12 +123,12 @@ class Sandbox:
                 raise ClosedError("the sandbox is closed") from None
             self.prepare()
             raise
-        full = bool(reply.get("full"))
         if full:
             self._end(child)
         self._free.put(None if full else child)
-        _raise(reply)
-        return dict(reply["facts"]), arrays
+        if isinstance(outcome, SandboxError):
+            raise outcome
+        return outcome, arrays
 
     def close(self) -> None:
         """Kill every child; running calls raise ClosedError."""
@@ -188,8 +188,10 @@ class _Child:
 
     def call(
         self, facts: Mapping[str, Any], body: Pieces, deadline: Deadline, memory: int, most: int
-    ) -> tuple[JsonObject, Arrays]:
-        """Return the reply to a call and its arrays. After an exception the child can't be used again."""
+    ) -> tuple[JsonObject | SandboxError, Arrays, bool]:
+        """Return the facts that answer a call, or the fault that the task reports, its arrays, and whether the child
+        is full. After an exception the child can't be used again.
+        """
         began = time.monotonic()
         try:
             with self._killed_by(deadline):
@@ -198,7 +200,8 @@ class _Child:
                     piece = body.popleft()
                     for start in range(0, len(piece), PIECE):
                         self._connection.send_bytes(piece[start : start + PIECE])
-                return receive(self._connection, most)
+                reply, arrays = receive(self._connection, most)
+                return _outcome(reply), arrays, bool(reply["full"])
         except (OSError, EOFError) as error:
             if deadline.passed:
                 raise LateError(f"it took longer than {max(round(deadline.time - began, 1), 0):g} s") from None
@@ -240,11 +243,11 @@ class _Child:
         self._process.wait()
 
 
-def _raise(reply: Mapping[str, Any]) -> None:
+def _outcome(reply: Mapping[str, Any]) -> JsonObject | SandboxError:
     match reply.get("error"):
         case None:
-            return
+            return dict(reply["facts"])
         case "memory":
-            raise OutOfMemoryError("it needs more memory than allowed")
+            return OutOfMemoryError("it needs more memory than allowed")
         case error:
-            raise FailedError(str(error), str(reply["sentence"])[:LONGEST_SENTENCE])
+            return FailedError(str(error), str(reply["sentence"])[:LONGEST_SENTENCE])

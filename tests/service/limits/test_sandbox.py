@@ -134,6 +134,7 @@ def test_a_process_that_does_not_listen_is_no_trap(children: Callable[[], set[in
         ("kill", OutOfMemoryError, "probably because memory ran out"),
         ("babble", DiedError, "can't be read"),
         ("lie", DiedError, "can't be read"),
+        ("leave_out", DiedError, "can't be read"),
         ("text", DiedError, "can't be read"),
         ("mistake", FailedError, r"KeyError: 'missing' \(tasks.py, line \d+\)"),
     ],
