@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 
 from shapespace.bundle.reader import BundleError, check_place, manifest_digest, read_bundle, read_files
@@ -170,11 +169,14 @@ class ModelRepository:
 
     def signature(self) -> Signature:
         """Return the state of the folder and of the file, which changes with any bundle, without reading bundles."""
-        folders: list[Path] = []
+        paths = [self._file] if self._file else []
         with suppress(OSError):  # the folder is changing; the next check compares again
-            folders = bundle_folders(self._folder)[0]
+            for folder in bundle_folders(self._folder)[0]:
+                paths.append(folder)
+                with suppress(OSError):
+                    paths += folder.iterdir()
         found = []
-        for path in chain([self._file] if self._file else [], folders, *(folder.glob("*") for folder in folders)):
+        for path in paths:
             with suppress(OSError):
                 status = path.stat(follow_symlinks=path == self._file)
                 found.append((str(path), status.st_size, status.st_mtime_ns, status.st_ino))
