@@ -171,7 +171,10 @@ def _limits(service: Service, model: ShapeModel) -> ModelLimits:
 
 
 def _statistics(service: Service, model: ShapeModel) -> ModelStatistics:
-    return service.inferences.setdefault((model.manifest.name, model.manifest.version), ModelStatistics.of(model))
+    key = model.manifest.name, model.manifest.version
+    if key not in service.inferences:
+        service.inferences[key] = ModelStatistics.of(model)
+    return service.inferences[key]
 
 
 def _all_statistics(service: Service, models: Iterable[ShapeModel]) -> StatisticsAnswer:
