@@ -112,7 +112,9 @@ class Connection(H11Protocol):
         if self._refused or (self._answered and self.conn.their_state is h11.SEND_BODY):
             self._dropped += len(data)
             if self._dropped > LINGER_BYTES:
-                self.transport.abort()
+                self._end()
+                self.flow.pause_reading()
+                return
         if not self._refused:
             super().data_received(data)
 
@@ -181,6 +183,10 @@ class Connection(H11Protocol):
         with suppress(h11.LocalProtocolError):  # HEAD has no body
             for event in (head, h11.Data(data=body), h11.EndOfMessage()):
                 self.transport.write(self.conn.send(event) or b"")
-        self.transport.write_eof()
+        self._end()
         self.flow.resume_reading()
+
+    def _end(self) -> None:
+        """Close the connection in a moment; closing at once could take an answer from a client that still sends."""
+        self.transport.write_eof()
         self.loop.call_later(LINGER_SECONDS, self.transport.abort)
