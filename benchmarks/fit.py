@@ -24,6 +24,7 @@ from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.mesh.rigid_motion import Placement, align
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.fit_result import FitStatus, Fitted
+from shapespace.model.shape import Quality
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.collection.generators import figure
 
@@ -152,7 +153,7 @@ class Bench:
         times = []
         for code in model.population.sample(12, 1).astype(np.float32):
             began = time.process_time()
-            model.shape(code)
+            model.shape(code, quality=Quality.FULL)
             times.append(time.process_time() - began)
         self.solved = float(np.median(times))
 
@@ -162,7 +163,7 @@ class Bench:
         codes = self.model.decoder.training_codes
         if codes is None:
             raise ValueError(f"{self.model.manifest.name} has no codes of the training shapes, as components need")
-        return np.stack([self.model.shape(code).vertices for code in codes.astype(np.float32)])
+        return np.stack([self.model.shape(code, quality=Quality.FULL).vertices for code in codes.astype(np.float32)])
 
     def distance(self, found: FloatArray, truth: FloatArray) -> float:
         """Return the mean distance of shapes (V, 3) in the same place, as a fraction of the diagonal."""
