@@ -30,8 +30,9 @@ from shapespace.training.collection.generators import figure
 
 #: Number of points of a scan; noise as a share of the diagonal; share of outliers.
 POINTS, NOISE, OUTLIERS = 4000, 0.005, 0.02
-#: A fit has failed if its error exceeds this multiple of the median, and this share of the diagonal. NINETY is half the
-#: width of a 90 % interval, in standard deviations.
+#: A fit has failed if its error exceeds this multiple of the error of the code that `encode` finds for the same shape,
+#: whose vertices it knows, and this share of the diagonal. NINETY is half the width of a 90 % interval, in standard
+#: deviations.
 FAILED, FAR, NINETY = 2.0, 0.01, 1.645
 VARIANTS = ("whole", "noisy", "camera")
 #: Steps of the closest-point fit with principal components; candidates for the weight of the mean; number of training
@@ -239,7 +240,7 @@ def failures(*rows: Row) -> list[int]:
     counts = np.zeros(4, int)
     for row in rows:
         errors, converged = np.array(row.errors), np.array(row.converged)
-        failed = errors > max(FAILED * np.median(errors), FAR)
+        failed = errors > np.maximum(FAILED * np.array(row.encoded or 0), FAR)
         counts += [len(errors), failed.sum(), (failed & ~converged).sum(), (~failed & ~converged).sum()]
     return [int(count) for count in counts]
 
@@ -312,6 +313,8 @@ def write_page() -> None:
         lost=lost,
         noticed=noticed,
         equal=100 * equal,
+        times=[float(np.median(np.concatenate([row.seconds for row in rows]))) for rows in models.values()],
+        names=list(models),
         table=table(("", *scans, "wrong"), (line(name, rows) for name, rows in unseen.items())),
         drawn=[max(float(np.median(rows[k].errors)) for rows in drawn.values()) for k in range(3)],
         drawn_wrong=listed(drawn, 1),

@@ -138,13 +138,13 @@ def stages(folders: list[Path], count: int) -> None:
     tails: list[list[str]] = []
     beside: list[list[str]] = []
     exact: list[list[str]] = []
-    for path, others in ((path, folder != folders[0]) for folder in folders for path in bundles(folder)):
+    for path, is_fold in ((path, folder != folders[0]) for folder in folders for path in bundles(folder)):
         model = ShapeModel(read_bundle(path))
         codes = draw(model, count + 3)
         times = measure(path, model, codes)
         median = {name: statistics.median(values[3:]) for name, values in times.items()}
         distances = away(model, codes)
-        name = f"{model.manifest.name}{' (a fold)' if others else ''}, V = {model.manifest.vertices}"
+        name = f"{model.manifest.name}{' (a fold)' if is_fold else ''}, V = {model.manifest.vertices}"
         medians[name] = median
         exact.append([name, *to_exact(model, codes)])
         steps = statistics.mean(times["iterations"][3:])

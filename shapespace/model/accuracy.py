@@ -20,8 +20,8 @@ MEASURED_CODES = 50
 #: that a rare code with a bad draft gets more steps than were needed in the measurement.
 TOLERANCES = (None, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 #: Largest mean distance between ``auto`` and full shapes, as a share of the mean distance between full and exact
-#: shapes. By the triangle inequality, ``auto`` is then at most 1.1 times as far from exact shapes on average. A distance
-#: of at most TOLERANCE is allowed too, since full shapes are known no better.
+#: shapes. By the triangle inequality, ``auto`` is then at most 1.1 times as far from exact shapes on average.
+#: TOLERANCE is allowed too, since full shapes are known no better.
 SHARE = 0.1
 #: Largest share by which drafts that are answered as they are move ``auto`` away from exact shapes, by estimate. In
 #: fact they move it by 0.6 of that: an estimated 0.12 was 0.07 for Freaky Torus.

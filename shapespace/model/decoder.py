@@ -14,7 +14,7 @@ from shapespace.bundle.geometry import FineMesh
 from shapespace.bundle.reader import Bundle, BundleError
 from shapespace.coordinates.integrability import Integrability
 from shapespace.coordinates.nric import nric
-from shapespace.coordinates.reconstruction import MAX_ITERATIONS, Reconstructor
+from shapespace.coordinates.reconstruction import MAX_ITERATIONS, Reconstruction, Reconstructor
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -205,13 +205,7 @@ class Decoder:
                 found = reconstruct.draft(target, tolerance, good_misfit, deadline)
             if found is None:
                 quality = Quality.FULL if quality is Quality.DRAFT else quality
-                for tolerance, limit in self._efforts(quality):
-                    starts = self._learned_start(code)
-                    found = reconstruct.from_guess(
-                        target, *starts, tolerance=tolerance, max_iterations=limit, deadline=deadline
-                    )
-                    if found.converged and not found.flipped_faces:
-                        break
+                found = self._from_guess(reconstruct, code, target, quality, deadline)
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 vertices = self.finish(found.vertices, mesh)
@@ -233,11 +227,21 @@ class Decoder:
         seconds = {"network": predicting, "reconstruct": time.perf_counter() - began}
         return Shape(vertices, diagnostics, seconds)
 
-    def _efforts(self, quality: Quality) -> list[tuple[float, int]]:
-        """Return tolerances and numbers of iterations for a shape without a draft, in the order of their costs."""
-        if quality is Quality.FULL or self.auto is None:
-            return [(TOLERANCE, MAX_ITERATIONS)]
-        return list(zip((self.auto.tolerance or TOLERANCE, TOLERANCE), AUTO_ITERATIONS, strict=True))
+    def _from_guess(
+        self, reconstruct: Reconstructor, code: Codes, target: FloatArray, quality: Quality, deadline: Deadline | None
+    ) -> Reconstruction:
+        """Reconstruct a shape without a draft; for ``auto`` in few iterations, and in more where faces are folded."""
+        efforts = [(TOLERANCE, MAX_ITERATIONS)]
+        if quality is Quality.AUTO and self.auto is not None:
+            efforts = list(zip((self.auto.tolerance or TOLERANCE, TOLERANCE), AUTO_ITERATIONS, strict=True))
+        for tolerance, limit in efforts:
+            starts = self._learned_start(code)
+            found = reconstruct.from_guess(
+                target, *starts, tolerance=tolerance, max_iterations=limit, deadline=deadline
+            )
+            if found.converged and not found.flipped_faces:
+                break
+        return found
 
     def lengths_and_angles(self, code: Codes) -> tuple[FloatArray, FloatArray]:
         """Return edge lengths and dihedral angles in radians (2E,) that the networks predict for a code (m,).
