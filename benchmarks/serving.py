@@ -138,13 +138,13 @@ def stages(folders: list[Path], count: int) -> None:
     tails: list[list[str]] = []
     beside: list[list[str]] = []
     exact: list[list[str]] = []
-    for path in (path for folder in folders for path in bundles(folder)):
+    for path, is_fold in ((path, folder != folders[0]) for folder in folders for path in bundles(folder)):
         model = ShapeModel(read_bundle(path))
         codes = draw(model, count + 3)
         times = measure(path, model, codes)
         median = {name: statistics.median(values[3:]) for name, values in times.items()}
         distances = away(model, codes)
-        name = f"{model.manifest.name}, V = {model.manifest.vertices}"
+        name = f"{model.manifest.name}{' (a fold)' if is_fold else ''}, V = {model.manifest.vertices}"
         medians[name] = median
         exact.append([name, *to_exact(model, codes)])
         steps = statistics.mean(times["iterations"][3:])
@@ -168,6 +168,8 @@ def stages(folders: list[Path], count: int) -> None:
     print(table(("", "p50 / p95 / p99", "full / draft", "without MKL ÷ p50"), tails))
     print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. V is the")
     print("number of coarse vertices. Without [MKL](../reference/glossary.md#blas-mkl), LAPACK solves.")
+    if len(folders) > 1:
+        print("Models of a fold are those of [served models](served.md).")
     print("\nShapes of quality `auto` are as close to the exact exponential as full shapes.\n")
     print(table(("mean distance, 1e-4 of the diagonal", "auto", "full", "draft"), exact))
     print("\nIn brackets are multiples of the distance of full shapes. A product by design has a formula instead of an")

@@ -164,7 +164,7 @@ class _Fit:
         """Return the placements of shapes (k, V, 3) at which a search begins, the best first."""
         constraints = search.constraints
         if len(constraints.landmarks) < 3:
-            shown = shapes[:, self.prepared.shown]
+            shown = shapes[:, self.prepared.shown[: effort.shape_points]]
             return start_placements(
                 search.scan, shown, partial=constraints.partial, free=constraints.free, effort=effort
             )
@@ -188,8 +188,8 @@ class _Fit:
         both = [self.starts, *([more] if more else [])]
         starts = StartShapes(*(np.concatenate(each) for each in zip(*both, strict=True)))
         states = [self._start(search, starts, start) for start in self._placed(search, effort, starts.shapes)]
-        done, most = 0, sum(max(2, round(part * len(states))) * steps for part, steps in SETTINGS.rounds)
-        for part, steps in SETTINGS.rounds:
+        done, most = 0, sum(max(2, round(part * len(states))) * steps for part, steps in effort.rounds)
+        for part, steps in effort.rounds:
             some = states[: max(2, round(part * len(states)))]
             if part == 0 and some[-1].cost > SETTINGS.behind * some[0].cost:
                 some.pop()
@@ -225,7 +225,7 @@ class _Fit:
     def _insistently(self, rough: FitSearch, middle: FitSearch, state: FitState) -> FitState:
         """Return the best fit with solved shapes, after further attempts while it is poor."""
         tried: dict[Attempt, FitState] = {}
-        for attempt in SETTINGS.attempts:
+        for attempt in SETTINGS.attempts_of_part if self.constraints.partial else SETTINGS.attempts:
             if self._late or not self._is_poor(*middle.shares(state)):
                 break
             if tried.get(attempt) is state:  # it would end in the same place
@@ -235,24 +235,25 @@ class _Fit:
             if here is None:
                 break
             here = rough.run(here, 0, first=False)
-            found = self._attempted(rough, attempt, here)
-            if found is not None and found.cost < here.cost:
-                state = min(state, self._solved(middle, found), key=lambda each: each.cost)
+            better = [each for each in self._attempted(rough, attempt, here) if each.cost < here.cost]
+            state = min([state, *(self._solved(middle, each) for each in better)], key=lambda each: each.cost)
         return state
 
-    def _attempted(self, rough: FitSearch, attempt: Attempt, state: FitState) -> FitState | None:
-        """Return a fit with rough shapes that an attempt finds, beginning at a poor fit; None if it finds no other."""
+    def _attempted(self, rough: FitSearch, attempt: Attempt, state: FitState) -> list[FitState]:
+        """Return fits with rough shapes that an attempt finds, beginning at a poor fit."""
         if attempt is Attempt.RESTART:
-            return self._roughly(rough, THOROUGH if self.constraints.partial else MORE, self.remembered)[0]
+            best, others = self._roughly(rough, THOROUGH if self.constraints.partial else MORE, self.remembered)
+            apart = [each for each in others[: SETTINGS.rivals] if self._apart(each, best) > SETTINGS.elsewhere]
+            return [best, *apart]
         if attempt is Attempt.PULL:
             found = rough.run(state, SETTINGS.attempt_steps, first=False, drawn=SETTINGS.drawn_steps)
         else:
             code = self.prepared.exchange(rough.reconstruct, self._judge, state)
             begun = None if code is state.code else rough.start(code, state.placement, state.shape)
             if begun is None:
-                return None
+                return []
             found = rough.run(begun, SETTINGS.attempt_steps, first=True)
-        return rough.with_moved_feature(found, self.features, SETTINGS.attempt_steps)
+        return [rough.with_moved_feature(found, self.features, SETTINGS.attempt_steps)]
 
     @cached_property
     def _judge(self) -> ShapeJudge:

@@ -17,7 +17,7 @@ from shapespace.model.fit_result import VertexDerivatives
 from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import Distribution
 from shapespace.model.part_exchange import PartExchange
-from shapespace.model.placement import evenly
+from shapespace.model.placement import THOROUGH, evenly
 from shapespace.model.scan import InvalidScanError
 from shapespace.model.searched_shapes import SearchedShapes
 
@@ -53,8 +53,8 @@ class FitPreparation:
 
     @cached_property
     def shown(self) -> IntArray:
-        """Evenly spread coarse vertices, which represent a shape in the search for placements."""
-        return evenly(self.decoder.reference.vertices, SETTINGS.shape_points)
+        """Coarse vertices that represent a shape in the search for placements; the first ones are spread evenly too."""
+        return evenly(self.decoder.reference.vertices, THOROUGH.shape_points)
 
     @cached_property
     def starts(self) -> StartShapes:

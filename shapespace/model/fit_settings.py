@@ -18,13 +18,12 @@ class ScanFitSettings:
 
     Attributes:
         start_shapes, random_shapes: number of start shapes, chosen as far apart as possible from random shapes.
-        shape_points: number of points of a start shape that are compared with the scan.
         coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
-        rounds: for each round, the share of the starts that take part, at least two starts, and their steps.
         behind: in the last round, a second start takes part if it costs at most this multiple of the best.
         middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
         again_steps: further steps with few points after a feature has moved.
-        attempts, attempt_steps: attempts to improve a poor fit, one after another, and the steps of each,
+        attempts, attempts_of_part: attempts to improve a poor fit to a scan (of a part), one after another.
+        attempt_steps: steps of each attempt,
         drawn_steps: of which this number pulls unmatched parts together.
         alike: a training shape at a smaller mean distance from a fit is not tried.
         units, units_of_part: a scan (of a part) that is this many times larger or smaller than the model's shapes is
@@ -43,10 +42,8 @@ class ScanFitSettings:
 
     start_shapes: int = 16
     random_shapes: int = 200
-    shape_points: int = 150
     coarse_vertices: int = 500
     fine_vertices: int = 2000
-    rounds: tuple[tuple[float, int], ...] = ((1.0, 2), (0.5, 2), (0.0, 3))
     behind: float = 1.5
     middle_steps: int = 8
     last_steps: int = 6
@@ -56,6 +53,7 @@ class ScanFitSettings:
         Attempt.RESTART,
         *2 * (Attempt.PULL, Attempt.EXCHANGE),
     )
+    attempts_of_part: tuple[Attempt, ...] = (Attempt.RESTART, *3 * (Attempt.PULL, Attempt.EXCHANGE))
     attempt_steps: int = 9
     drawn_steps: int = 4
     units: float = 3.0

@@ -65,6 +65,8 @@ def test_a_straight_line_model_is_served_without_training(
         errors = [np.abs(align(shape, near) - near).max() / size for shape, near in zip(shapes, found, strict=True)]
         assert max(errors) < 2e-3
     else:
+        assert model.decoder.auto is not None
+        assert model.decoder.auto.tolerance is None, "lines need no Gauss–Newton"
         for code in (np.array([0.5, -0.7]), lines.coefficients[0], 1.2 * run.collection.upper):
             served = model.decode(code)
             expected = align(scale * lines.shape(code)[0], served)
