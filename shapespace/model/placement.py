@@ -46,9 +46,18 @@ class PlacementEffort:
 
 #: Effort for most scans.
 QUICK = PlacementEffort(points=150, rotations=60, kept=8, polished=6, steps=5, count=4)
-#: Effort where the best fit is poor: for whole scans, and for scans of a part. There a flat shape looks alike from both
-#: sides, and only many points of the shape tell which side it is.
-MORE = PlacementEffort(points=150, rotations=240, kept=24, polished=24, steps=8, count=12)
+#: Effort where the best fit is poor: for whole scans, and for scans of a part. Only many points of a shape tell its
+#: front from its back, or one finger from another.
+MORE = PlacementEffort(
+    points=300,
+    rotations=120,
+    kept=24,
+    polished=48,
+    steps=8,
+    count=16,
+    shape_points=1000,
+    rounds=((1.0, 3), (0.5, 3), (0.25, 6)),
+)
 THOROUGH = PlacementEffort(
     points=150,
     rotations=100,
