@@ -289,7 +289,10 @@ def write_page() -> None:
     tried, lost, noticed, _ = failures(*(row for rows in every.values() for row in rows))
     scans = "whole", "noisy", "one camera"
     counts = sorted({len(row.errors) for rows in every.values() for row in rows})
-    equal = max(abs(1 - np.median(row.errors) / np.median(row.components)) for row in unseen["hippocampus"])
+    largest = {
+        name: max(np.median(row.errors) / np.median(row.components) for row in rows) for name, rows in unseen.items()
+    }
+    farther = [f"{name} (up to {100 * (ratio - 1):.0f} % larger)" for name, ratio in largest.items() if ratio > 1]
 
     def line(name: str, rows: list[Row]) -> list[str]:
         many, wrong, told, _ = failures(*rows)
@@ -312,7 +315,7 @@ def write_page() -> None:
         all=tried,
         lost=lost,
         noticed=noticed,
-        equal=100 * equal,
+        farther=" and ".join(farther),
         times=[float(np.median(np.concatenate([row.seconds for row in rows]))) for rows in models.values()],
         names=list(models),
         table=table(("", *scans, "wrong"), (line(name, rows) for name, rows in unseen.items())),
