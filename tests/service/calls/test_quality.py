@@ -1,6 +1,7 @@
 """``quality=auto``, the default: as close to exact shapes as ``full``, in fewer steps; codes far outside the bounds."""
 
 import copy
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from shapespace.bundle.writer import amend_bundle
 from shapespace.mesh.rigid_motion import align
 from shapespace.model.accuracy import measure_accuracy
-from shapespace.model.decoder import AUTO_ITERATIONS, TOLERANCE, MeshChoice
+from shapespace.model.decoder import ITERATIONS_OUTSIDE, TOLERANCE, MeshChoice
 from shapespace.model.exact_shapes import exact_shape
 from shapespace.model.latent_space import Distribution
 from shapespace.model.shape import Quality
@@ -99,16 +100,19 @@ def test_without_a_measured_error_auto_is_as_accurate_as_full_shapes_are(model: 
 def test_codes_whose_frames_are_inconsistent_take_few_steps_too() -> None:
     torus = load(ROOT / "models" / "freaky-torus")
     codes = torus.decoder.latents.sample(2600, 7, Distribution.UNIFORM)
-    for k, most in ((489, 3), (1860, 3), (849, AUTO_ITERATIONS[-1])):
+    for k in (489, 1860):
         auto, full = (torus.shape(codes[k], mesh=MeshChoice.COARSE, quality=q) for q in (Quality.AUTO, Quality.FULL))
         assert full.diagnostics.iterations > 50
-        assert auto.diagnostics.iterations <= most
+        assert auto.diagnostics.iterations <= 3
+        assert auto.diagnostics.flipped_faces == 0
         true = exact(torus, codes[k])
         auto_error, full_error = (
             np.linalg.norm(align(shape.vertices, true) - true, axis=1).mean() for shape in (auto, full)
         )
         assert auto_error < 3 * full_error
-    assert auto.diagnostics.flipped_faces == full.diagnostics.flipped_faces > 0, "the last one has folds in any case"
+    # Where a few steps leave folded faces, the shape is solved as for full.
+    auto, full = (torus.shape(codes[849], quality=quality).diagnostics for quality in (Quality.AUTO, Quality.FULL))
+    assert auto == dataclasses.replace(full, quality="auto")
 
 
 def test_every_call_answers_auto_by_default(tmp_path: Path, start: Start) -> None:
@@ -144,7 +148,7 @@ def test_every_call_answers_auto_by_default(tmp_path: Path, start: Start) -> Non
         assert diagnostics(inferred)["quality"] == "auto"
 
         far = diagnostics(client.post(f"{MODEL}/mesh", json={"latent": FAR}))
-        assert (far["quality"], far["iterations"] <= AUTO_ITERATIONS[-1]) == ("auto", True)
+        assert (far["quality"], far["iterations"] <= ITERATIONS_OUTSIDE) == ("auto", True)
         for size in (99.0, 1e9):
             for name in by_name:
                 refused = client.post(f"{MODEL}/mesh", json={"latent": [size] * 20, "quality": name})
