@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,17 +58,7 @@ MORE = PlacementEffort(
     shape_points=1000,
     rounds=((1.0, 3), (0.5, 3), (0.25, 6)),
 )
-THOROUGH = PlacementEffort(
-    points=150,
-    rotations=100,
-    kept=48,
-    polished=48,
-    steps=15,
-    count=24,
-    first_steps=4,
-    shape_points=1000,
-    rounds=((1.0, 3), (0.5, 3), (0.25, 6)),
-)
+THOROUGH = replace(MORE, points=150, rotations=100, kept=48, steps=15, count=24, first_steps=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,24 +192,25 @@ def _at(shape: FloatArray, some: FloatArray, rotations: FloatArray, places: Floa
 
 
 def _searched(
-    k: int, shape: FloatArray, some: FloatArray, begun: _Placements, steps: int, *, partial: bool, free: bool
+    k: int, shape: FloatArray, some: FloatArray, placements: _Placements, steps: int, *, partial: bool, free: bool
 ) -> list[StartPlacement]:
     """Move a shape by steps to the closest points, from several placements at once, and score where it ends."""
     tree, tree_of_scan = cKDTree(shape), None if partial else cKDTree(some)
-    placements = begun
-    for step in range(steps + 1):
-        to_shape, own = nearest_points(tree, placements.back(some))
-        here, there, away = shape[own], np.broadcast_to(some, (*own.shape, 3)), to_shape
-        scores = _trimmed(to_shape)
+    for left in range(steps, -1, -1):
+        away, own = nearest_points(tree, placements.back(some))
+        scores = _trimmed(away)
         if tree_of_scan is not None:
             to_scan, other = nearest_points(tree_of_scan, placements.there(shape))
             to_scan /= placements.scales[:, None]
             scores = scores + _trimmed(to_scan)
+        if not left:
+            break
+        here, there = shape[own], np.broadcast_to(some, (*own.shape, 3))
+        if tree_of_scan is not None:
             here = np.concatenate([here, np.broadcast_to(shape, (*other.shape, 3))], axis=1)
             there, away = np.concatenate([there, some[other]], axis=1), np.concatenate([away, to_scan], axis=1)
-        if step < steps:
-            close = away <= np.quantile(away, TRIMMED, axis=1, keepdims=True)
-            placements = placements.or_between(here, there, close, scaled=free)
+        close = away <= np.quantile(away, TRIMMED, axis=1, keepdims=True)
+        placements = placements.or_between(here, there, close, scaled=free)
     return [
         StartPlacement(k, Placement(turn, shift, float(scale)), float(score))
         for turn, shift, scale, score in zip(*placements, scores, strict=True)
