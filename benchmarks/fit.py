@@ -40,6 +40,8 @@ VARIANTS = ("whole", "noisy", "camera")
 COMPONENT_STEPS, HOLDS, CHOOSING = 40, (1e-5, 1e-4, 1e-3, 1e-2, 1e-1), 4
 #: Stored figures, one file for each model.
 FIGURES = ROOT / "runs" / "fit"
+#: Stored times of fits, one row for each kind of scan: `benchmarks.fit_time`.
+FIT_TIMES = ROOT / "runs" / "fit-times.json"
 
 
 @dataclass
@@ -322,6 +324,7 @@ def write_page() -> None:
         drawn=[max(float(np.median(rows[k].errors)) for rows in drawn.values()) for k in range(3)],
         drawn_wrong=listed(drawn, 1),
         alarms=listed(models, 3),
+        timed=pages.read_figures(FIT_TIMES),
         held=", ".join(
             held(scans[k], [rows[k] for name, rows in drawn.items() if name != "freaky-torus"]) for k in range(3)
         ),

@@ -1,21 +1,22 @@
-"""The table "Time of a fit" of docs/measurements/fit.md: ``python -m benchmarks.fit_time`` prints it.
+"""The table "Time of a fit" of docs/measurements/fit.md: ``python -m benchmarks.fit_time`` measures it.
 
 The unit is a solved shape, timed beside each fit, so that the figures depend little on the machine.
 """
 
 import argparse
 import itertools
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
-from benchmarks.fit import POINTS, sampled, scan
-from benchmarks.pages import ROOT, table
+from benchmarks import pages
+from benchmarks.fit import FIT_TIMES, POINTS, sampled, scan, write_page
+from benchmarks.pages import ROOT
 from shapespace.arrays import FloatArray
 from shapespace.mesh.closest_points import MeshProximity, VertexFaces
 from shapespace.model.shape_model import ShapeModel, load
@@ -69,12 +70,12 @@ def measured(
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure, store the figures, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=10, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=500, help="seed of the first scan")
     given = parser.parse_args()
-    rows = []
+    rows: list[dict[str, Any]] = []
     with threadpool_limits(1):
         for name, kinds in MODELS.items():
             model = load(ROOT / "models" / name)
@@ -83,15 +84,24 @@ def main() -> None:
                 seeds = range(given.seed, given.seed + given.scans)
                 found = [measured(model, variant, seed, by_surface=name != "figure", kind=kind) for seed in seeds]
                 times, errors = (np.array([each[k] for each in found]) for k in (0, 1))
-                spread = f"{100 * np.median(errors):.3f} ({100 * np.quantile(errors, 0.9):.3f})"
                 settled = np.array([each[2] == "converged" for each in found])
                 wrong = errors > WRONG
-                missed = f"{wrong.sum()} ({(wrong & settled).sum()})"
-                title = f"{name}, {variant}" + ("" if kind == "population" else f", {kind}")
-                rows.append([title, f"{np.median(times):.0f}", spread, missed, str(settled.sum())])
-                print(rows[-1], file=sys.stderr, flush=True)
-    heads = ("scan", "time", "median error (90th percentile)", "wrong (not noticed)", "converged")
-    print(table(heads, rows))
+                rows.append(
+                    {
+                        "model": name,
+                        "scan": variant,
+                        "codes": kind,
+                        "scans": len(found),
+                        "time": float(np.median(times)),
+                        "error": [float(np.quantile(errors, share)) for share in (0.5, 0.9)],
+                        "wrong": int(wrong.sum()),
+                        "unnoticed": int((wrong & settled).sum()),
+                        "converged": int(settled.sum()),
+                    }
+                )
+                print(rows[-1], flush=True)
+    pages.write_figures(FIT_TIMES, rows)
+    write_page()
 
 
 if __name__ == "__main__":

@@ -22,8 +22,9 @@ from benchmarks.pages import ROOT
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.shell.space import ShellSpace
+from shapespace.training.learning.baselines import Exact, MultilinearGrid, grid_nodes
 from shapespace.training.learning.composite import affine_sum
-from shapespace.training.learning.evaluation import r_squared
+from shapespace.training.learning.evaluation import HeldOutSamples, r_squared
 from shapespace.training.learning.learner import Learner
 from shapespace.training.learning.networks import predict
 from shapespace.training.report.number_format import r2
@@ -31,8 +32,9 @@ from shapespace.training.runs import workers
 from shapespace.training.runs.config import Config, load, parse
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.latent_coordinates import alone
-from shapespace.training.runs.sampling import DONE, KNOWN, columns
+from shapespace.training.runs.sampling import DONE, KNOWN, Collection, columns
 from shapespace.training.space import modes
+from shapespace.training.space.factors import group, overlap
 from shapespace.training.space.generalisation import PrincipalComponents
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.stages.networks import learner_of
@@ -62,8 +64,10 @@ MIRRORED = "-mirrored"
 SYMMETRIC = ("faces", "makehuman", MANNEQUIN)
 #: Runs whose extrapolation is measured: an easy and a difficult one.
 EXTRAPOLATED = ("hand", "samba")
+#: Runs with multilinear grids of small factors, as in the paper's table.
+GRIDDED = ("hand", "faces")
 #: Studies, each with the last stage whose results it measures.
-STUDIES = {"space": "samples", "limits": "evaluation"}
+STUDIES = {"space": "samples", "limits": "evaluation", "grids": "samples"}
 #: Stored figures, one file for each run.
 FIGURES = ROOT / "runs" / "results"
 
@@ -114,6 +118,8 @@ def figures(name: str, run: Run) -> dict[str, Any]:
         have(directory, "space", lambda: compactness(directory, run.config))
     if name in EXTRAPOLATED:
         have(directory, "limits", lambda: {"extrapolation": extrapolation(learner_of(run))})
+    if name in GRIDDED:
+        have(directory, "grids", lambda: small_grids(run))
     factors, decomposed, ingest = directory.factors.read(), directory.modes.read(), directory.ingest.read()
     sizes = [len(members) for members in factors["factors"]]
     shared = np.array(factors["overlap"])[~np.eye(len(sizes), dtype=bool)]
@@ -190,12 +196,9 @@ def extrapolation(learner: Learner) -> list[dict[str, Any]]:
     rows = []
     for reach in REACHES:
         codes = middle + reach * half * unit
-        every = [codes, *(alone(codes, index) for index in factors)]
-        parts = [part for kind in every for part in np.split(kind, len(kind) // 10)]
-        done = dict(workers.run(collection.shapes, parts))
-        found = [done[k] for k in range(len(parts))]
-        z = np.concatenate([shapes.nric for shapes in found]).reshape(len(every), CODES, -1)
-        there = np.array([not reason for shapes in found for reason in shapes.reasons]).reshape(len(every), CODES)
+        every = np.concatenate([codes, *(alone(codes, index) for index in factors)])
+        z = exact_shapes(collection, every).reshape(1 + len(factors), CODES, -1)
+        there = np.isfinite(z[..., 0])
         kept = there.all(axis=0)
         latents = torch.as_tensor(codes[kept], dtype=torch.float32)
         answers = {
@@ -206,6 +209,52 @@ def extrapolation(learner: Learner) -> list[dict[str, Any]]:
         r2 = {name: r_squared(answer, z[0, kept], norm)["total"] for name, answer in answers.items()}
         rows.append({"reach": reach, "failed": int((~there[0]).sum()), "compared": int(kept.sum()), "r2": r2})
     return rows
+
+
+def exact_shapes(collection: Collection, codes: FloatArray) -> FloatArray:
+    """Return NRIC (n, 2E) of codes (n, m), NaN for a code without a shape."""
+    done = dict(workers.run(collection.shapes, np.array_split(codes, -(-len(codes) // 10))))
+    found = [done[k] for k in range(len(done))]
+    z = np.concatenate([shapes.nric for shapes in found])
+    z[[bool(reason) for shapes in found for reason in shapes.reasons]] = np.nan
+    return z
+
+
+#: Most modes of a factor with a grid, as in the paper, and most nodes along each of them.
+GRID_MODES, GRID_NODES = 4, 16
+
+
+def small_grids(run: Run) -> dict[str, Any]:
+    """Measure an affine sum of multilinear grids on the test codes: one grid for each of many small factors.
+
+    Returns the ``sizes`` of the factors, the ``nodes`` along the modes of each, ``bytes`` of all grids, R², and the
+    number of test codes that were ``compared``. The others lie beside nodes without a shape.
+    """
+    learner = learner_of(run)
+    collection, test = learner.collection, HeldOutSamples.of(learner)
+    z = np.ascontiguousarray(run.directory.modes.read()["nric"])
+    norm = WeightedNorm.of(run.directory.mean_mesh(), run.config.material.eta)
+    # No factor gets more than twice the mean number of modes.
+    groups = group(overlap(z, norm), -(-2 * len(z) // GRID_MODES))
+    settings = run.config.evaluation.model_copy(update={"grid_nodes": GRID_NODES})
+    nodes = [grid_nodes(len(index), settings) for index in groups]
+
+    def exact(codes: FloatArray) -> Exact:
+        return Exact(exact_shapes(collection, codes).astype(np.float32), np.empty((0, 0, 0), np.float32))
+
+    grids = [
+        MultilinearGrid(collection.coordinates, index, count, exact) for index, count in zip(groups, nodes, strict=True)
+    ]
+    z_reference = nric(collection.reference.vertices, collection.reference.connectivity)
+    found = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
+    kept = np.flatnonzero(np.isfinite(found).all(axis=1))
+    return {
+        "sizes": [len(index) for index in groups],
+        "nodes": nodes,
+        "bytes": sum(grid.size for grid in grids),
+        "r2": test.r2_of(found[kept], kept),
+        "compared": len(kept),
+    }
 
 
 def drawn(run: RunDirectory, factors: int) -> dict[str, Any]:
