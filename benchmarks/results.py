@@ -345,6 +345,8 @@ def write_page() -> None:
     }
     for row in rows.values():
         row["evaluation"] = studies.EMPTY | {"limit": None} | row["evaluation"]
+        row["studies"] = dict.fromkeys(STUDIES, {}) | row["studies"]
+        row.setdefault("steps", 16)
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
         plot_samples(some, pages.MEASUREMENTS / "results-samples.png")
@@ -352,6 +354,7 @@ def write_page() -> None:
         "results",
         rows=rows,
         real=real,
+        chosen={name: row for name, row in real.items() if "paper" in row["evaluation"]["r2"]},
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         largest=rows.get(LARGEST),
         expressive=rows.get(EXPRESSIVE),
