@@ -45,9 +45,11 @@ def models(run: Run, studio: Studio, path: Path) -> None:
     found: dict[str, NDArray] = {
         "composite": predict(composite, latents).numpy(),
         "our recipe, one factor": predict(learner.monolithic(), latents).numpy(),
-        "the paper's monolithic": predict(learner.monolithic_paper(), latents).numpy(),
-        "affine sum of factors": affine_sum(rest, predict(composite.factor_shapes, latents).numpy()),
+        "the paper's single network": predict(learner.monolithic_paper(), latents).numpy(),
     }
+    if run.config.networks.paper:
+        found["the paper's system"] = predict(learner.paper(), latents).numpy()
+    found["affine sum of factors"] = affine_sum(rest, predict(composite.factor_shapes, latents).numpy())
     compared(found, exact, studio, Reconstructor(reference, eta), path)
 
 
