@@ -25,6 +25,8 @@ MOTION_WEIGHTS = (1.0, 0.1, 0.01)
 #: Among the meshes with the fewest specks and folds, the first one is taken whose smallest face has at least this
 #: share of the area of the smallest face in the best of them.
 NEARLY_BEST = 0.9
+#: Most vertices of all shapes together that collapses are checked against, since each takes about 150 bytes.
+MOST_CHECKED = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,9 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     result says what remains.
 
     Each collapse takes a fraction of a millisecond. A large mesh is therefore thinned first, by many collapses at once,
-    in time about linear in its number of vertices. Thinning takes only a few shapes into account. Raises MeshError if
-    the shapes have another number of vertices, or coordinates that are not finite.
+    in time about linear in its number of vertices. Thinning takes only a few shapes into account. Of a large collection
+    (`MOST_CHECKED`), evenly spaced shapes stand for all, also in the result. Raises MeshError if the shapes have
+    another number of vertices, or coordinates that are not finite.
     """
     shapes = np.asarray(shapes, dtype=np.float64)
     if shapes.ndim != 3 or shapes.shape[1:] != fine.vertices.shape:
@@ -85,12 +88,17 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     if bad:
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
     if len(fine.vertices) <= max(THINNING.vertices, THINNING.ratio * target):
-        return _best(fine, target, shapes)
-    some = np.unique(np.linspace(0, len(shapes) - 1, THINNING.shapes).astype(int)) if len(shapes) else ()
-    few = np.stack([fine.vertices, *(shapes[k] for k in some)])
+        return _best(fine, target, shapes[_evenly(len(shapes), MOST_CHECKED // len(fine.vertices))])
+    few = np.stack([fine.vertices, *(shapes[k] for k in _evenly(len(shapes), THINNING.shapes))])
     kept, faces = thin(fine.connectivity, few, max(THINNING.left, THINNING.left_ratio * target))
-    found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[:, kept])
+    some = _evenly(len(shapes), MOST_CHECKED // len(kept))
+    found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[np.ix_(some, kept)])
     return replace(found, fine_index=kept[found.fine_index])
+
+
+def _evenly(count: int, most: int) -> IntArray:
+    """Return the indices of at most ``most`` of ``count`` shapes, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(count, max(1, most))).astype(int))
 
 
 def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
@@ -113,7 +121,8 @@ def _decimated(fine: TriangleMesh, target: int, wanted: int, shapes: FloatArray,
     """Decimate to ``wanted`` vertices and heal; thin parts then lose vertices, and at most ``target`` are left."""
     edge = np.sqrt(2 / np.sqrt(3) * fine.area / target)
     # A closed surface has about twice as many faces as vertices, and other surfaces slightly fewer.
-    mean_areas = face_areas(shapes, fine.faces).sum(axis=1) / (2 * target)
+    # One shape at a time, as all faces of all shapes would take more memory than anything else.
+    mean_areas = np.array([face_areas(shape, fine.faces).sum() for shape in shapes]) / (2 * target)
     decimation = Decimation(fine.connectivity, shapes, mean_areas, SMALL_EDGE * edge, motion_weight)
     sines = np.sin(np.deg2rad(ANGLE_LIMITS))
     spare = int((1 + HEALING_SHARE) * wanted)
