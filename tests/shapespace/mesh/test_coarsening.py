@@ -339,3 +339,12 @@ def test_the_folds_that_are_left_are_counted():
     cosines = neighbour_cosines(kept, found.faces)
     assert found.folds == (cosines < np.cos(np.deg2rad(140))).any(axis=0).sum()
     assert found.folds > 0
+
+
+def test_evenly_spaced_shapes_stand_for_a_large_collection(fine, monkeypatch):
+    shapes = np.stack([bent(fine.vertices, angle) for angle in np.linspace(0.2, 2, 9)])
+    few = coarsen(fine, 40, shapes[[0, 4, 8]])
+    monkeypatch.setattr(coarsening, "MOST_CHECKED", 3 * len(fine.vertices) + 2)
+    found = coarsen(fine, 40, shapes)
+    assert found.faces.tolist() == few.faces.tolist()
+    assert found.smallest_angle == few.smallest_angle
