@@ -71,7 +71,7 @@ modes. The last column has the exponent p, if the time grows as n^p. Stages belo
 
 {seconds}
 
-The largest process takes {memory}. `python -m benchmarks.stages --people` measures this.
+No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core. The largest process takes {memory}. A [cluster](../how-to/cluster.md) computes the samples; other stages run on one machine, as their steps need all shapes or are short. `python -m benchmarks.stages --people` measures this.
 
 """
 
@@ -95,6 +95,8 @@ class Size:
 BASE = Size()
 #: Poses of each body where the number of people grows, and the fewest seconds whose growth means anything.
 PEOPLE_POSES, SHOWN = 5, 5.0
+#: Number of shapes for which the page extrapolates the time.
+MORE_PEOPLE = 1500
 SIZES = [
     BASE,
     *(replace(BASE, fine=fine) for fine in (40_000, 160_000)),
@@ -119,13 +121,14 @@ def collection(size: Size) -> tuple[FloatArray, FloatArray]:
 
 
 def config(size: Size, data: Path) -> str:
-    """Return the configuration of a run."""
+    """Return the configuration of a run. Bodies always have the same time steps, so that only their number changes."""
     return f"""
 [collection]
 data = "{data}"
 coarse_vertices = {size.coarse}
 [modes]
 count = {size.modes}
+{"" if size.fine else "log_steps = 8"}
 [samples]
 count = {JOINT}
 factor_counts = {OF_FACTORS}
@@ -234,6 +237,11 @@ def people_section(rows: list[dict[str, Any]]) -> str:
     for line, stage in zip(lines, stages, strict=True):
         growth = np.log(last["seconds"][stage] / max(first["seconds"][stage], 0.1))
         line.append(f"{growth / np.log(last['size']['shapes'] / first['size']['shapes']):.2f}")
+    exponents = {stage: float(line[-1]) for stage, line in zip(stages, lines, strict=True)}
+    more = last["seconds"] | {
+        stage: last["seconds"][stage] * (MORE_PEOPLE / last["size"]["shapes"]) ** power
+        for stage, power in exponents.items()
+    }
     memory = ", ".join(f"{row['megabytes']['most']:.0f} MB with {row['size']['shapes']} shapes" for row in rows)
     size = Size(**first["size"])
     return PEOPLE.format(
@@ -243,6 +251,9 @@ def people_section(rows: list[dict[str, Any]]) -> str:
         shown=SHOWN,
         seconds=table(("", *columns, "exponent"), lines),
         memory=memory,
+        fastest=max(exponents.values()),
+        more=MORE_PEOPLE,
+        hours=sum(more.values()) / 3600,
     )
 
 
