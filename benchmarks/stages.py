@@ -71,9 +71,9 @@ modes. The last column has the exponent p, if the time grows as n^p. Stages belo
 
 {seconds}
 
-No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core. The largest
-process takes {memory}. A [cluster](../how-to/cluster.md) computes the samples. Other stages run on one machine, because
-they are short or their steps need all shapes. `python -m benchmarks.stages --people` measures this.
+No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core. The
+largest process takes {memory}. A [cluster](../how-to/cluster.md) computes the samples. Other stages run on one machine,
+because they are short or their steps need all shapes. `python -m benchmarks.stages --people` measures this.
 
 """
 
