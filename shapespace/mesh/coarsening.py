@@ -88,7 +88,9 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     if bad:
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
     if len(fine.vertices) <= max(THINNING.vertices, THINNING.ratio * target):
-        return _best(fine, target, shapes[_evenly(len(shapes), MOST_CHECKED // len(fine.vertices))])
+        every = len(shapes) * len(fine.vertices) <= MOST_CHECKED
+        some = slice(None) if every else _evenly(len(shapes), MOST_CHECKED // len(fine.vertices))
+        return _best(fine, target, shapes[some])
     few = np.stack([fine.vertices, *(shapes[k] for k in _evenly(len(shapes), THINNING.shapes))])
     kept, faces = thin(fine.connectivity, few, max(THINNING.left, THINNING.left_ratio * target))
     some = _evenly(len(shapes), MOST_CHECKED // len(kept))
