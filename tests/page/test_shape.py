@@ -279,11 +279,12 @@ def test_one_line_says_how_good_the_shape_is_by_what_is_usual_for_the_model(wind
     residual = 0.06
     studio.type(2, 0.4)
     studio.eventually(lambda: chip.inner_text() == "Fits less well")
-    assert studio["#diagnostics"].get_attribute("class") == "fair"
+    # busy while a better shape of the same code is on its way
+    studio.eventually(lambda: studio["#diagnostics"].get_attribute("class") == "fair")
     residual = 0.2
     studio.type(2, 0.5)
     studio.eventually(lambda: chip.inner_text() == "Hardly exists")
-    assert studio["#diagnostics"].get_attribute("class") == "poor"
+    studio.eventually(lambda: studio["#diagnostics"].get_attribute("class") == "poor")
 
 
 def test_a_slider_is_dragged(studio: OpenPage) -> None:
