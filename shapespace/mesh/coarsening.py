@@ -88,13 +88,10 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     if bad:
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
     if len(fine.vertices) <= max(THINNING.vertices, THINNING.ratio * target):
-        every = len(shapes) * len(fine.vertices) <= MOST_CHECKED
-        some = slice(None) if every else _evenly(len(shapes), MOST_CHECKED // len(fine.vertices))
-        return _best(fine, target, shapes[some])
+        return _best(fine, target, shapes)
     few = np.stack([fine.vertices, *(shapes[k] for k in _evenly(len(shapes), THINNING.shapes))])
     kept, faces = thin(fine.connectivity, few, max(THINNING.left, THINNING.left_ratio * target))
-    some = _evenly(len(shapes), MOST_CHECKED // len(kept))
-    found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[np.ix_(some, kept)])
+    found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[:, kept])
     return replace(found, fine_index=kept[found.fine_index])
 
 
@@ -104,6 +101,8 @@ def _evenly(count: int, most: int) -> IntArray:
 
 
 def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
+    if len(shapes) * len(fine.vertices) > MOST_CHECKED:
+        shapes = shapes[_evenly(len(shapes), MOST_CHECKED // len(fine.vertices))]
     shapes = np.concatenate([fine.vertices[None], shapes])
     found = [_coarsen(fine, target, shapes, weight) for weight in MOTION_WEIGHTS]
     fewest = min((coarsening.specks, coarsening.folds) for coarsening in found)
