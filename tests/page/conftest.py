@@ -73,7 +73,7 @@ def window(browser: Browser, server: Server) -> Iterator[Open]:
 
     yield open
     for studio, complains in windows:
-        studio.page.unroute_all(behavior="ignoreErrors")  # answers under way would fail in the next test
+        studio.let_through()
         studio.page.context.close()
         studio.require_calm(complains)
 

@@ -114,6 +114,13 @@ class OpenPage:
     def _said(self) -> list[str]:
         return [*self.complaints, *self["#messages, #verdict"].all_text_contents()]
 
+    def let_through(self) -> None:
+        """Leave all requests to the server again; errors of handlers that still run are ignored.
+
+        Playwright's `unroute` would raise them: it lets a request pass that a handler is about to answer.
+        """
+        self.page.unroute_all(behavior="ignoreErrors")
+
     def open(self, hash: str = "#model=with-fine") -> OpenPage:
         """Load the page and wait until its full shape is drawn."""
         self.page.goto(f"{self.url}/{hash}")
@@ -126,7 +133,7 @@ class OpenPage:
         self.page.set_viewport_size({"width": width, "height": height})
         if self.page.url == "about:blank":
             return self.open(hash)
-        self.page.unroute_all(behavior="ignoreErrors")
+        self.let_through()
         self.page.mouse.move(0, 0)
         self.page.evaluate(RESET)
         # All that belongs to a model is made anew with the next one.

@@ -78,7 +78,7 @@ def test_random_shapes_repeat_by_their_seed(studio: OpenPage) -> None:
     held.routes.pop().abort()
     studio.frames(3)
     assert (studio.code, studio.messages) == (second, ""), "an earlier answer is no longer wanted"
-    studio.page.unroute_all()
+    studio.let_through()
     studio["#random"].click()
     studio.eventually(lambda: studio.code != second)
     studio.coordinate(2).locator("[data-do=lock]").click()

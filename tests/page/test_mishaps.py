@@ -248,5 +248,5 @@ def test_who_returns_before_another_model_has_arrived_stays(studio: OpenPage) ->
         studio.frames(3)
         assert studio["#model"].input_value() == "with-fine"
         assert "Small torus" in studio.page.title()
-        studio.page.unroute_all()
+        studio.let_through()
     studio.until_code([0.2, 0, 0])
