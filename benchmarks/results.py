@@ -22,7 +22,7 @@ from benchmarks.pages import ROOT
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm, nric
 from shapespace.shell.space import ShellSpace
-from shapespace.training.learning.baselines import Exact, MultilinearGrid, grid_nodes
+from shapespace.training.learning.baselines import Exact, factor_grids
 from shapespace.training.learning.composite import affine_sum
 from shapespace.training.learning.evaluation import HeldOutSamples, r_squared
 from shapespace.training.learning.learner import Learner
@@ -237,20 +237,17 @@ def small_grids(run: Run) -> dict[str, Any]:
     # No factor gets more than twice the mean number of modes.
     groups = group(overlap(z, norm), -(-2 * len(z) // GRID_MODES))
     settings = run.config.evaluation.model_copy(update={"grid_nodes": GRID_NODES})
-    nodes = [grid_nodes(len(index), settings) for index in groups]
 
-    def exact(codes: FloatArray) -> Exact:
+    def exact(name: str, codes: FloatArray) -> Exact:
         return Exact(exact_shapes(collection, codes).astype(np.float32), np.empty((0, 0, 0), np.float32))
 
-    grids = [
-        MultilinearGrid(collection.coordinates, index, count, exact) for index, count in zip(groups, nodes, strict=True)
-    ]
+    grids = factor_grids(collection.coordinates, groups, settings, exact)
     z_reference = nric(collection.reference.vertices, collection.reference.connectivity)
     found = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
     kept = np.flatnonzero(np.isfinite(found).all(axis=1))
     return {
         "sizes": [len(index) for index in groups],
-        "nodes": nodes,
+        "nodes": [grid.nodes for grid in grids],
         "bytes": sum(grid.size for grid in grids),
         "r2": test.r2_of(found[kept], kept),
         "compared": len(kept),

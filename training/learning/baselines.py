@@ -1,6 +1,6 @@
 """Baselines without networks: kernel ridge regression on codes, and multilinear interpolation of each factor."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -17,7 +17,6 @@ from shapespace.training.learning.latent_features import LatentFeatures
 from shapespace.training.learning.layers import Scaling
 from shapespace.training.learning.linear import Ridge, principal_axes
 from shapespace.training.runs.latent_coordinates import Coordinates
-from shapespace.training.runs.sampling import Collection
 from shapespace.training.runs.settings import EvaluationSettings
 
 
@@ -129,7 +128,8 @@ class MultilinearGrid:
         closed = np.pad(values, [*((0, end) for end in ends), (0, 0)], mode="wrap")
         # Rounding may move a code slightly outside of the grid.
         self.interpolate = RegularGridInterpolator(axes, closed, bounds_error=False, fill_value=None)
-        self.factor, self.size = factor, values.nbytes  # bytes of the values at the nodes
+        self.factor, self.nodes = factor, nodes
+        self.size = values.nbytes  # bytes of the values at the nodes
 
     def __call__(self, latents: FloatArray) -> FloatArray:
         """Return NRIC (n, 2E) of the factor's part of codes (n, m)."""
@@ -141,13 +141,13 @@ def grid_nodes(dimension: int, settings: EvaluationSettings) -> int:
     return min(settings.grid_nodes, int(settings.grid_size ** (1 / dimension) + 1e-9))
 
 
-def factor_grids(collection: Collection, settings: EvaluationSettings, exact: ExactShapes) -> list[MultilinearGrid]:
+def factor_grids(
+    coordinates: Coordinates, factors: Iterable[list[int]], settings: EvaluationSettings, exact: ExactShapes
+) -> list[MultilinearGrid]:
     """Return a grid for each factor, or an empty list if the grid of one factor would be too coarse."""
-    factors = list(collection.factors.values())
-    nodes = [grid_nodes(len(index), settings) for index in factors]
-    if min(nodes) < FEWEST_NODES:
+    each = [(index, grid_nodes(len(index), settings)) for index in factors]
+    if min(nodes for _, nodes in each) < FEWEST_NODES:
         return []
     return [
-        MultilinearGrid(collection.coordinates, index, count, partial(exact, f"grid-{j}"))
-        for j, (index, count) in enumerate(zip(factors, nodes, strict=True))
+        MultilinearGrid(coordinates, index, nodes, partial(exact, f"grid-{j}")) for j, (index, nodes) in enumerate(each)
     ]

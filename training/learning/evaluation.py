@@ -129,7 +129,9 @@ def evaluate(learner: Learner, exact: ExactShapes) -> tuple[dict[str, Any], dict
         "affine of learned factors": test.r2_of(affine_sum(z_reference, learned)),
     }
     sizes = {name: size_bytes(model) for name, model in models.items()}
-    if settings.baselines and (grids := factor_grids(collection, settings, exact)):
+    if settings.baselines and (
+        grids := factor_grids(collection.coordinates, collection.factors.values(), settings, exact)
+    ):
         interpolated = affine_sum(z_reference, np.stack([grid(test.latents) for grid in grids], axis=1))
         # A node without a shape leaves NaN around it.
         if np.isfinite(interpolated).all():
