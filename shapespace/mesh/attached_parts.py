@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray, IntArray, evenly_spaced
 from shapespace.mesh.prolongation import AttachedPart, Prolongation, bind_points
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
@@ -31,7 +31,7 @@ def attach_part(
     The part has the vertices (k,) of the fine mesh. It lies at ``rest`` (k, 3), and at ``parts`` (n, k, 3) in the
     coarse shapes (n, V, 3).
     """
-    some = np.unique(np.linspace(0, len(rest) - 1, SAMPLE).astype(int))
+    some = evenly_spaced(len(rest), SAMPLE)
     distances = [np.asarray(cKDTree(part).query(shape)[0]) for shape, part in zip(shapes, parts, strict=True)]
     near = np.argsort(np.mean(distances, axis=0), kind="stable")[:CANDIDATES]
     rows = np.arange(len(near) * len(some))

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray, IntArray, evenly_spaced
 from shapespace.mesh.decimation import Decimation
 from shapespace.mesh.thinning import thin
 from shapespace.mesh.triangle_mesh import Connectivity, MeshError, TriangleMesh, face_areas
@@ -89,20 +89,15 @@ def coarsen(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
         raise MeshError(f"shape {bad[0]} has a coordinate that is not finite")
     if len(fine.vertices) <= max(THINNING.vertices, THINNING.ratio * target):
         return _best(fine, target, shapes)
-    few = np.stack([fine.vertices, *(shapes[k] for k in _evenly(len(shapes), THINNING.shapes))])
+    few = np.stack([fine.vertices, *(shapes[k] for k in evenly_spaced(len(shapes), THINNING.shapes))])
     kept, faces = thin(fine.connectivity, few, max(THINNING.left, THINNING.left_ratio * target))
     found = _best(TriangleMesh.from_arrays(fine.vertices[kept], faces), target, shapes[:, kept])
     return replace(found, fine_index=kept[found.fine_index])
 
 
-def _evenly(count: int, most: int) -> IntArray:
-    """Return the indices of at most ``most`` of ``count`` shapes, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(count, max(1, most))).astype(int))
-
-
 def _best(fine: TriangleMesh, target: int, shapes: FloatArray) -> Coarsening:
     if len(shapes) * len(fine.vertices) > MOST_CHECKED:
-        shapes = shapes[_evenly(len(shapes), MOST_CHECKED // len(fine.vertices))]
+        shapes = shapes[evenly_spaced(len(shapes), MOST_CHECKED // len(fine.vertices))]
     shapes = np.concatenate([fine.vertices[None], shapes])
     found = [_coarsen(fine, target, shapes, weight) for weight in MOTION_WEIGHTS]
     fewest = min((coarsening.specks, coarsening.folds) for coarsening in found)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray, IntArray, evenly_spaced
 from shapespace.mesh.quadrics import monomials, quadrics_of
 from shapespace.mesh.triangle_mesh import Connectivity
 from shapespace.mesh.triangle_quality import FOLD_LIMIT, Pairs, Triangles, folded_pairs
@@ -50,7 +50,7 @@ class Decimation:
         centred = shapes - shapes.mean(axis=1, keepdims=True)
         # Vertex first: a check gathers a few vertices of every shape.
         self._points = np.ascontiguousarray(np.moveaxis(centred, 0, 1))
-        chosen = np.unique(np.linspace(0, len(shapes) - 1, QUADRIC_SHAPES).astype(int))
+        chosen = evenly_spaced(len(shapes), QUADRIC_SHAPES)
         self._sample = np.ascontiguousarray(self._points[:, chosen])
         self._monomials = monomials(self._sample)
         self._quadrics, self._areas = quadrics_of(connectivity, centred[chosen])

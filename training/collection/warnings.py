@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import KDTree
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray, IntArray, evenly_spaced
 from shapespace.mesh.triangle_mesh import Connectivity, face_areas
 from shapespace.mesh.vertex_order import ORDER, VertexEdges, extent, times_longer
 from shapespace.training.collection.large_arrays import TOGETHER, columns, room
@@ -58,7 +58,7 @@ class Placements:
     """
 
     def __init__(self, vertices: FloatArray) -> None:
-        chosen = np.unique(np.linspace(0, vertices.shape[1] - 1, SAMPLE).astype(int))
+        chosen = evenly_spaced(vertices.shape[1], SAMPLE)
         points = np.stack([shape[chosen] for shape in vertices])
         points -= points.mean(axis=1, keepdims=True)
         # Scaled, as the squares of very small coordinates (1e-200) would underflow to 0.
@@ -192,7 +192,7 @@ class _EdgeLengths:
         shortest, longest = (room((len(vertices), count), np.float32) for _ in range(2))
         extents, self._middle = np.empty((2, len(vertices)))
         most = min(20 * SAMPLE, TOGETHER // len(vertices))
-        some = np.unique(np.linspace(0, connectivity.edge_count - 1, most).astype(int))
+        some = evenly_spaced(connectivity.edge_count, most)
         i, j = connectivity.edges[some].T
         sample = np.empty((len(vertices), len(some)))
         for k, shape in enumerate(vertices):
