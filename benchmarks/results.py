@@ -333,6 +333,12 @@ def plot_samples(rows: dict[str, dict[str, Any]], path: Path) -> None:
     plt.close(figure)
 
 
+def in_order(evaluation: dict[str, Any]) -> bool:
+    """Return whether R² on test codes has the order of the paper's table: system, single network, affine sum."""
+    system, single, affine = (evaluation["r2"][model]["total"] for model in ("paper", "monolithic_paper", "affine"))
+    return bool(system > single > affine)
+
+
 def write_page() -> None:
     """Write the page from all stored figures."""
     rows = {
@@ -347,11 +353,13 @@ def write_page() -> None:
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
         plot_samples(some, pages.MEASUREMENTS / "results-samples.png")
+    chosen = {name: row for name, row in real.items() if "paper" in row["evaluation"]["r2"]}
     page = pages.render(
         "results",
         rows=rows,
         real=real,
-        chosen={name: row for name, row in real.items() if "paper" in row["evaluation"]["r2"]},
+        chosen=chosen,
+        in_order={name: in_order(row["evaluation"]) for name, row in chosen.items()},
         shell={name: rows[name + SHELL] for name in COLLECTIONS if name + SHELL in rows},
         largest=rows.get(LARGEST),
         expressive=rows.get(EXPRESSIVE),

@@ -130,8 +130,8 @@ def initialise(meshes: Path, out: Path | None, file: str | None, parts: Sequence
         print(f"  {note}")
     accept = " ".join(shlex.quote(collection.names[warning.shape]) for warning in collection.warnings if warning.grave)
     if accept:
-        print(f"A run would stop at {accept}: correct or remove it, or use it as it is with --accept {accept}")
-    print(f"Next: {_program()} run {near(written)}")
+        print(f"A run would stop at {accept}: correct or remove it. --accept {accept} uses it as it is")
+    print(f"Next: {_program()} run {near(written)}" + (f" --accept {accept}" if accept else ""))
 
 
 @_command

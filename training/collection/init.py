@@ -41,7 +41,7 @@ data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; rel
 # first_step = "{exponential.first_step}"    # how a geodesic begins; "paper" needs far more time steps to be as exact
 
 [modes]
-geometry = "auto"    # "vertices" and "nric" are straight lines, fast to find; "exponential" bends; "auto" chooses
+geometry = "auto"    # "exponential" bends; "vertices", "nric", "differential" are straight lines and fast; or "auto"
 # count = "{mode.count}"    # how many numbers describe a shape, at most {most}; "auto" stops when more help little
 # norm = "{mode.norm}"    # how errors of modes are measured; "shell", as in the paper, gives larger vertex errors
 
@@ -90,7 +90,7 @@ def configuration(
     coarse = (
         f"coarse_vertices = {target}    # vertices to compute with; more take longer, 0 takes all {vertices}"
         if vertices > NEARLY_COARSE * target
-        else f"# coarse_vertices = {target}    # meshes with more vertices are simplified to this number"
+        else f"# coarse_vertices = {target}    # meshes with over 1.5 times as many vertices are simplified"
     )
     return TEMPLATE.format(
         shapes=count,

@@ -43,10 +43,16 @@ class MeshCollection:
         return self.faces[self.parts[0].faces] if self.parts else self.faces
 
     def index(self, name: str | None) -> int:
-        """Return the index of a shape by its name, or of the most central shape for None; IngestError if unknown."""
-        if name is not None and name not in self.names:
-            raise IngestError(Fault("", f"no shape is called {name!r}", f"there are {', '.join(self.names[:8])} …"))
-        return self.central if name is None else self.names.index(name)
+        """Return the index of a shape by its name or file, or of the most central one for None.
+
+        Raises IngestError if there is no such shape.
+        """
+        if name is None:
+            return self.central
+        for known in (name, Path(name).stem):
+            if known in self.names:
+                return self.names.index(known)
+        raise IngestError(Fault("", f"no shape is called {name!r}", f"there are {', '.join(self.names[:8])} …"))
 
     def require_accepted(self, accepted: Sequence[str]) -> None:
         """Refuse shapes with a grave warning, unless the user accepts them by their names or files.

@@ -129,7 +129,7 @@ def fit(
             state["best"] = error
             best = _copied(network)
         rate = optimisers[0].param_groups[0]["lr"]
-        epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}")
+        epochs.set_postfix(train=f"{total:.2e}", validation=f"{error:.2e}", rate=f"{rate:.0e}", refresh=False)
         epochs.update()
         state["done"] = state["epoch"] >= state["epochs"] or rate < settings.final_rate
         if not state["done"] and state["epoch"] % CHECKPOINT_EPOCHS == 0:

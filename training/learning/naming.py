@@ -32,7 +32,7 @@ def bundle_names(
     ({'upper left bends': [0]}, ['upper left bends'])
     """
     if unknown := sorted(settings.names.keys() - {*factors, *coordinates}):
-        known = ", ".join(dict.fromkeys([*factors, *coordinates]))
+        known = ", ".join(f'"{name}"' for name in dict.fromkeys([*factors, *coordinates]))
         raise NamingError(
             f"export.names has {unknown[0]!r}, which is neither a factor nor a coordinate. There are {known}."
         )

@@ -36,6 +36,13 @@ SIMPLE = {
     "linear_nric": "straight lines of lengths and angles",
     "differential_coordinates": "straight lines of rotations and stretches",
 }
+#: The maps from codes to shapes, in words.
+MAPS = {
+    "vertices": "straight lines of vertices",
+    "nric": SIMPLE["linear_nric"],
+    "differential": SIMPLE["differential_coordinates"],
+    "exponential": "exponentials",
+}
 #: Largest number of modes with pictures.
 MODES_SHOWN = 40
 
@@ -60,10 +67,13 @@ def shape_pictures(record: Record, studio: Studio) -> Iterator[tuple[Markup, str
 
 
 def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
-    """Draw each SPGA mode beside the PGA mode of the same index: the mean moved along it, coloured by its support."""
+    """Draw each SPGA mode beside the PGA mode of the same index: the mean moved along it, coloured by its support. The
+    modes of straight lines stand alone.
+    """
     modes = record.modes
     factor_of = {i: factor for factor in record.factors for i in factor.modes}
-    kinds = [(kind, prefix) for kind, prefix in (("SPGA", ""), ("PGA", "pga_")) if f"{prefix}vertices" in modes]
+    own = record.mode_kind
+    kinds = [(kind, prefix) for kind, prefix in ((own, ""), ("PGA", "pga_")) if f"{prefix}vertices" in modes]
     support = {kind: record.supports(modes[f"{prefix}nric"]) for kind, prefix in kinds}
     reach = MODE_REACH * diagonal(studio.base)
     for i in range(min(len(modes["vertices"]), MODES_SHOWN)):
@@ -73,7 +83,7 @@ def mode_cards(record: Record, studio: Studio) -> Iterator[dict[str, Any]]:
             if i < len(support[kind]):
                 field = modes[f"{prefix}vertices"][i]
                 moved = studio.base + reach / np.linalg.norm(field, axis=1).max().clip(1e-300) * field
-                colours = tint(ramp(factor.hue if factor and kind == "SPGA" else NEUTRAL), support[kind][i])
+                colours = tint(ramp(factor.hue if factor and kind == own else NEUTRAL), support[kind][i])
                 local = modes.get(f"{prefix}localisation")
                 caption = kind if local is None else f"{kind} · {local[i]:.2f}"
                 alt = f"{title} of {kind}, coloured where it changes the shape"
@@ -142,7 +152,8 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
     cards = []
     if (facts := record.generalisation) and "failed" not in facts:
         how = (
-            f"{counted(facts['held_out'], 'shape')}, left out when mean and modes were found. Measured without networks"
+            f"{counted(facts['held_out'], 'shape')}, left out when map, mean and modes were chosen. Measured with "
+            "exact shapes instead of networks"
         )
         if facts.get("stuck"):
             how += f". The search for {counted(facts['stuck'], 'shape')} failed because faces collapse"
@@ -150,7 +161,7 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
             "title": "Unseen shapes",
             "how": how,
             "figures": [
-                (counted(count, "coordinate"), of, components)
+                (coordinates(count), of, components)
                 for count, of, components in zip(facts["counts"], facts["modes"], facts["components"], strict=True)
             ]
             + _converged(facts),
@@ -175,6 +186,11 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
             "pictures": _pair(record.run.least_near, facts["worst"], studio),
         })  # fmt: skip
     return cards
+
+
+def coordinates(count: float) -> str:
+    """Return a number of coordinates in words; a mean over folds may be no whole number."""
+    return counted(int(count) if count == int(count) else round(count, 1), "coordinate")
 
 
 def _converged(facts: dict[str, Any]) -> list[tuple[str, dict[str, float], dict[str, float]]]:

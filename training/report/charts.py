@@ -85,17 +85,18 @@ def mode_charts(record: Record) -> Iterator[tuple[str, Markup]]:
         rows = [
             Line(np.arange(len(y)), y, hue, kind, ".")
             for kind, y, hue in (
-                ("SPGA", record.modes["localisation"], HUES[0]),
+                (record.mode_kind, record.modes["localisation"], HUES[0]),
                 ("PGA", record.modes.get("pga_localisation"), HUES[1]),
             )
             if y is not None
         ]
-        yield "Localisation", lines("Localisation by mode, SPGA and PGA", "mode", rows)
+        kinds = " and ".join(row.name for row in rows)
+        yield "Localisation", lines(f"Localisation by mode, {kinds}", "mode", rows)
 
 
 def overlap_chart(record: Record) -> Markup | None:
     """Show the overlap of the supports of modes, on average over the modes of two factors."""
-    if not len(record.overlap):
+    if len(record.overlap) < 2:
         return None
 
     def draw(axes: Axes) -> None:

@@ -1,5 +1,6 @@
 """The report of a run: ``report.html``, one self-contained file of pictures, charts and tables."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import jinja2
 
 from shapespace.counted import counted
 from shapespace.training.report.cards import (
+    MAPS,
     accuracy_cards,
     extreme_shapes,
     factor_cards,
@@ -47,6 +49,15 @@ PLACED |= {
     "correction",
     "validation",
 }
+#: Keys of evaluation.json that say how well networks follow exact shapes.
+OF_NETWORKS = {"r2", "r2_factors", "fresh", "limit", "correction", "variants", "validation"}
+OF_NETWORKS |= {"affine_samples", "vertex_error"}
+#: Other keys of evaluation.json, in words.
+WORDS = {
+    "affine_samples": "test codes of the affine sums",
+    "exponentials": "exact shapes that training computed",
+    "derivatives": "of which with derivatives",
+}
 #: Descriptions of the kinds of corrections.
 CORRECTIONS = {
     "kernel": "kernel ridge regression",
@@ -69,7 +80,9 @@ def page(record: Record) -> str:
     """Return the HTML of a run's report."""
     studio = Studio.of(record)
     close = studio and studio.closer(record.reference["vertices"])
-    figures = record.evaluation
+    figures, straight = record.evaluation, record.map != "exponential"
+    if straight:  # exact but for rounding
+        figures = {name: value for name, value in figures.items() if name not in OF_NETWORKS}
     export = record.config.get("export", {})
     modes = record.modes if {"vertices", "nric"} <= record.modes.keys() else {}
     environment = jinja2.Environment(
@@ -98,22 +111,24 @@ def page(record: Record) -> str:
         mode_charts=list(mode_charts(record)),
         explained={
             kind: record.decomposition[key]
-            for kind, key in (("SPGA", "explained"), ("PGA", "pga_explained"))
-            if key in record.decomposition
+            for kind, key in (("these modes" if straight else "SPGA", "explained"), ("PGA", "pga_explained"))
+            if key in record.decomposition and f"{'pga_' if kind == 'PGA' else ''}vertices" in modes
         },
         support_bar=colour_bar(ramp(NEUTRAL), "unchanged", "changes most"),
         factors=list(factor_cards(record, close)),
         overlap=overlap_chart(record),
         losses=list(loss_charts(record)),
+        recipes=max(Counter(stem.rpartition("-")[0] for stem in record.histories).values(), default=1),
         longest=max((seconds for seconds in record.seconds.values() if seconds), default=1.0),
+        straight=straight,
         random=random_shapes(record, studio) if studio else [],
-        tests=extreme_shapes(record, studio) if studio else None,
-        strips=list(interpolation_strips(record, studio)) if studio else [],
+        tests=extreme_shapes(record, studio) if studio and not straight else None,
+        strips=list(interpolation_strips(record, studio)) if studio and not straight else [],
         evaluation=figures,
         models=MODELS,
         fractions=fraction_chart(record),
         correction=_correction(figures["correction"]) if "correction" in figures else "",
-        others=list(flatten({key: value for key, value in figures.items() if key not in PLACED})),
+        others=list(flatten({WORDS.get(key, key): value for key, value in figures.items() if key not in PLACED})),
     )
 
 
@@ -131,33 +146,24 @@ def _qualities(record: Record) -> list[tuple[str, str, str]]:
     ]
 
 
-#: The maps from codes to shapes, in words.
-GEOMETRIES = {
-    "vertices": "straight lines of vertices",
-    "nric": "straight lines of lengths and angles",
-    "differential": "straight lines of rotations and stretches",
-    "exponential": "exponentials",
-}
-
-
 def _geometry(choice: dict[str, Any]) -> str:
     """Return sentences on the map from codes to shapes, and what it gains; empty where nothing was chosen."""
     if not choice:
         return ""
     kind, errors = choice["kind"], choice["errors"]
-    sentence = f"Codes make shapes by {GEOMETRIES[kind]}"
+    sentence = f"Codes make shapes by {MAPS[kind]}"
     if not errors:
         return f"{sentence}."
-    others = [f"{percent(error)} by {GEOMETRIES[each]}" for each, error in errors.items() if each != kind]
+    others = [f"{percent(error, 3)} by {MAPS[each]}" for each, error in errors.items() if each != kind]
     found = (
-        f"{sentence}. The run chose this map on {counted(choice['held_out'], 'shape')}, held out in turn, with "
-        f"{counted(choice['compared'], 'coordinate')}. The error was {percent(errors.get(kind))}"
+        f"{sentence}. To choose the map, the run left {counted(choice['held_out'], 'shape')} out in turn. With "
+        f"{counted(choice['compared'], 'coordinate')}, their error was {percent(errors[kind], 3)}"
     )
     if not others:
         return f"{found}. The other maps had no mean shape."
     return (
-        f"{found}, beside {' and '.join(others)}. A cheaper map is chosen if its error is at most 2 % larger, or 5 % "
-        "larger than the error of exponentials."
+        f"{found}, beside {', '.join(others)}. A cheaper map is taken if its error is at most 2 % above the best "
+        "straight line, and at most 5 % above exponentials. The errors below are of other left-out shapes."
     )
 
 

@@ -77,6 +77,10 @@ class Record:
         )
         self.generalisation, self.encoded, grouping = map(_read, (run.generalisation, run.encoded, run.factors))
         self.geometry = _read(run.geometry)
+        #: Map from codes to shapes.
+        self.map: str = self.geometry.get("kind", "exponential")
+        #: What the report calls the modes.
+        self.mode_kind = "SPGA" if self.map == "exponential" else "mode"
         self.mean: FloatArray | None = mean.get("vertices")
         #: (V, 3) base point of tangent vectors: the mean, or the reference if there is no mean.
         self.base = self.reference.get("vertices") if self.mean is None else self.mean

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shapespace.counted import counted
-from shapespace.training.report.cards import SIMPLE
+from shapespace.training.report.cards import MAPS, SIMPLE, coordinates
 from shapespace.training.report.number_format import percent
 from shapespace.training.report.record import Record
 
 #: Errors that differ by less than this share count as equal.
 EQUAL = 0.05
+#: PCA is named instead of a better simple model if its error is larger by less than this share.
+SAME = 0.01
 #: More coordinates are advised if the last half of them removed at least this share of the unseen error.
 STILL_FALLS = 0.15
 #: More samples are advised if the networks' error is more than this share of the unseen error.
@@ -36,12 +37,24 @@ def verdict(record: Record) -> str:
     own, rival = unseen["modes"], _strongest(unseen)
     sentence = f"The model reproduces unseen shapes with a mean error of {percent(own)} of the diagonal"
     ratio = own / unseen[rival]
-    if ratio >= 2:
-        return f"{sentence}, {ratio:.2g} times as large as by the best simple model ({SIMPLE[rival]})."
-    if abs(1 - ratio) < EQUAL:
-        return f"{sentence}, about as well as the best simple model ({SIMPLE[rival]})."
     than = "less" if ratio < 1 else "more"
-    return f"{sentence}, {percent(abs(1 - ratio))} {than} than the best simple model ({SIMPLE[rival]})."
+    beside = (
+        f"{ratio:.2g} times as large as by the best simple model"
+        if ratio >= 2
+        else "about as well as the best simple model"
+        if abs(1 - ratio) < EQUAL
+        else f"{percent(abs(1 - ratio))} {than} than the best simple model"
+    )
+    return f"{sentence}, {beside} ({SIMPLE[rival]}).{_by_another_map(record)}"
+
+
+def _by_another_map(record: Record) -> str:
+    """Say so if the unseen shapes were left out of a model with another map."""
+    others = [each for each in record.generalisation.get("maps", ()) if each != record.map]
+    if not others:
+        return ""
+    words = " or ".join(MAPS[each] for each in others)
+    return f" This is the error of {words}: without these shapes, the run chose another map than for your model."
 
 
 def advice(record: Record) -> Iterator[str]:
@@ -49,7 +62,7 @@ def advice(record: Record) -> Iterator[str]:
     unseen, facts = _unseen(record), record.generalisation
     if not unseen or unseen["modes"] < NEGLIGIBLE:
         return
-    count, own, rival = facts["counts"][-1], unseen["modes"], _strongest(unseen)
+    own, rival = unseen["modes"], _strongest(unseen)
     compared = record.geometry.get("errors")
     if own > (1 + EQUAL) * unseen[rival] and not compared:
         yield (
@@ -57,14 +70,17 @@ def advice(record: Record) -> Iterator[str]:
             '"auto", which compares maps from codes to shapes.'
         )
     half, shapes = facts["modes"][-2]["mean"] if len(facts["modes"]) > 1 else own, _shapes(record)
-    room = 1.5 * count < 0.8 * shapes
+    # "auto" has stopped where more modes help little.
+    given_count = record.config.get("modes", {}).get("count", "auto")
+    room = given_count != "auto" and 1.5 * given_count < 0.8 * shapes
     if own < (1 - STILL_FALLS) * half and room:
+        more, fewer = map(coordinates, reversed(facts["counts"][-2:]))
         yield (
-            f"More modes: with {count} instead of {counted(facts['counts'][-2], 'coordinate')} the error on unseen "
-            f"shapes fell from {percent(half)} to {percent(own)}. Try modes.count = {round(1.5 * count)}."
+            f"More modes: with {more} instead of {fewer.split()[0]}, the error on unseen shapes fell from "
+            f"{percent(half)} to {percent(own)}. Try modes.count = {round(1.5 * given_count)}."
         )
     error = record.evaluation.get("vertex_error", {}).get("mean", 0.0)
-    if record.geometry.get("kind", "exponential") == "exponential" and error > NETWORKS * own:
+    if record.map == "exponential" and error > NETWORKS * own:
         given = record.config.get("samples", {}).get("count", 4000)
         yield f"More samples: the networks add {percent(error)}. Try samples.count = {2 * given}."
     trained = record.encoded.get("modes") or {}
@@ -85,7 +101,9 @@ def _unseen(record: Record) -> dict[str, float]:
 
 
 def _strongest(errors: Mapping[str, float]) -> str:
-    return min((name for name in errors if name != "modes"), key=lambda name: errors[name])
+    """Return the name of the best simple model, or the simplest of those that are as good."""
+    best = min((name for name in errors if name != "modes"), key=lambda name: errors[name])
+    return "components" if errors["components"] <= (1 + SAME) * errors[best] else best
 
 
 def _shapes(record: Record) -> int:

@@ -69,9 +69,30 @@ class Config(SettingsTable):
         return Material(self.material.mu, self.material.lambda_, self.material.eta)
 
     @property
+    def ineffective(self) -> list[str]:
+        """Given settings that change nothing without another setting, with that setting."""
+        needs = {
+            "evaluation.grid_nodes needs evaluation.baselines": self.evaluation.grid_nodes
+            and not self.evaluation.baselines,
+            "export.up needs export.faces": "up" in self.export.model_fields_set and self.export.faces is None,
+        }
+        return [sentence for sentence, unmet in needs.items() if unmet]
+
+    @property
     def unused(self) -> list[str]:
         """Names of the given settings that only version 0.2 used."""
         return [name for name in IGNORED if attrgetter(name)(self)]
+
+    @model_validator(mode="after")
+    def _factors_of_all_modes(self) -> Config:
+        count, factors = self.modes.count, self.factors
+        if count == "auto":  # the stage checks them
+            return self
+        if factors.modes is not None:
+            factors.require_partition(count)
+        if factors.count is not None and factors.count > count:
+            raise ValueError(f"factors: count = {factors.count} is more than modes.count = {count}")
+        return self
 
     @model_validator(mode="after")
     def _usable_correction(self) -> Config:

@@ -127,8 +127,8 @@ class FactorSettings(SettingsTable):
     count: int | None = Field(None, ge=1)
     """Number of factors; by default the overlap of the modes decides."""
     modes: list[Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]] | None = Field(None, min_length=1)
-    """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``, counted from 0, the strongest first. Set
-    ``modes.count`` too."""
+    """Your own factors: the modes of each, such as ``[[0, 3], [1], [2, 4]]``, counted from 0, the strongest first. Each
+    mode belongs to one factor. Set ``modes.count`` too. For exponentials only."""
 
     @model_validator(mode="after")
     def _each_mode_once(self) -> FactorSettings:
@@ -140,6 +140,16 @@ class FactorSettings(SettingsTable):
         if twice := sorted({mode for mode in listed if listed.count(mode) > 1}):
             raise ValueError(f"modes has {' and '.join(map(str, twice))} more than once; leave each mode in one factor")
         return self
+
+    def require_partition(self, count: int) -> None:
+        """Raise ValueError if the given factors name a mode that is not there, or leave one of ``count`` modes out."""
+        listed, every = {mode for factor in self.modes or () for mode in factor}, set(range(count))
+        problems = {"there is no mode": listed - every, "these modes are in no factor:": every - listed}
+        if faults := [f"{words} {', '.join(map(str, sorted(modes)))}" for words, modes in problems.items() if modes]:
+            raise ValueError(
+                f"factors.modes can't be used: {'; '.join(faults)}. There are {count} modes, counted from 0 to "
+                f"{count - 1}"
+            )
 
 
 class SampleSettings(SettingsTable):

@@ -74,18 +74,3 @@ def group(overlaps: FloatArray, count: int | None = None) -> list[list[int]]:
         a, b = sorted(divmod(int(shared.argmax()), len(groups)))
         groups[a] = sorted(groups[a] + groups.pop(b))
     return sorted(groups)
-
-
-def given(groups: Sequence[Sequence[int]], count: int) -> list[list[int]]:
-    """Check factors that the user has chosen among ``count`` modes; raises FactorError if they aren't a partition."""
-    listed = [mode for group in groups for mode in group]
-    problems = {
-        "there is no mode": sorted(set(listed) - set(range(count))),
-        "these modes are in no factor:": sorted(set(range(count)) - set(listed)),
-        "these modes are listed more than once:": sorted({mode for mode in listed if listed.count(mode) > 1}),
-    }
-    if faults := [f"{words} {', '.join(map(str, modes))}" for words, modes in problems.items() if modes]:
-        raise FactorError(
-            f"factors.modes can't be used: {'; '.join(faults)}. There are {count} modes, counted from 0 to {count - 1}"
-        )
-    return [list(group) for group in groups]

@@ -61,7 +61,8 @@ class PrincipalComponents:
         mean = align(shapes, reference).mean(axis=0)
         shapes = align(shapes, mean)
         mean = shapes.mean(axis=0)
-        u, s, axes = np.linalg.svd((shapes - mean).reshape(len(shapes), -1), full_matrices=False)
+        shapes -= mean
+        u, s, axes = np.linalg.svd(shapes.reshape(len(shapes), -1), full_matrices=False)
         return cls(mean, axes, u * s)
 
     def nearest(self, shapes: FloatArray, count: int) -> FloatArray:

@@ -16,6 +16,7 @@ from shapespace.coordinates.nric import nric
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.collection.large_arrays import room, stacked
 from shapespace.training.collection.mesh_collection import normalised
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
@@ -100,26 +101,38 @@ def _encode_collection(run: Run, bundle: Path) -> None:
     if fine is not None:
         mesh = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
         given, index = fine, reference["fine_index"]
-    found = [
-        model.encode(scale * shape)
-        for shape in progress(given, "finding the codes of your shapes", "shape", len(given))
-    ]
-    near = np.stack([each.shape.vertices for each in found]) / scale
-    linear = PrincipalComponents.of(given, mesh.vertices).nearest(given, model.latents.dimension)
-    away, other = (vertex_distances(each, given, mesh.diagonal) for each in (near, linear))
+    diagonal = mesh.diagonal
+    other = _of_components(given, mesh.vertices, model.latents.dimension, diagonal)
+    # One shape at a time, as the fine shapes of a large collection fill the memory.
+    away, outside = room(other.shape), []
+    for k, shape in enumerate(progress(given, "finding the codes of your shapes", "shape", len(given))):
+        found = model.encode(scale * shape)
+        away[k] = vertex_distances(found.shape.vertices / scale, shape, diagonal)
+        if not found.inside_bounds:
+            outside.append(str(names[k]))
     worst = int(away.mean(axis=1).argmax())
+    least_near = model.encode(scale * given[worst]).shape.vertices / scale
     facts = summary(away) | {
         "mesh": "coarse" if fine is None and "fine_faces" in reference else "fine",
         "components": summary(other),
         "modes": directory.decomposition.read().get("left"),
         "remembered": run.config.export.examples,
         "shapes": len(given),
-        "outside": [str(name) for name, each in zip(names, found, strict=False) if not each.inside_bounds],
+        "outside": outside,
         "worst": str(names[worst]),
     }
-    directory.least_near.write(given=given[worst][index], found=near[worst][index])
+    directory.least_near.write(given=given[worst][index], found=least_near[index])
     directory.encoded.write({MADE_BY: made_by()} | facts)
     directory.log("encoded", **facts)
+
+
+def _of_components(shapes: FloatArray, reference: FloatArray, count: int, diagonal: float) -> FloatArray:
+    """Return vertex distances (n, V) between shapes (n, V, 3) and the nearest shapes of as many components."""
+    linear = PrincipalComponents.of(shapes, reference)
+    found = (linear.nearest(each[None], count)[0] for each in shapes)
+    return stacked(
+        len(shapes), (vertex_distances(near, each, diagonal) for near, each in zip(found, shapes, strict=True))
+    )
 
 
 def _fine_shapes(run: Run) -> FloatArray | None:

@@ -5,9 +5,11 @@ import itertools
 import numpy as np
 
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.runs.config import Config
+from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.factor_names import names
-from shapespace.training.space.factors import between, given, group, overlap
-from shapespace.training.stages.stage import Run, Stage
+from shapespace.training.space.factors import FactorError, between, group, overlap
+from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 #: Name of the factor of a straight-line model.
 WHOLE = "whole shape"
@@ -31,7 +33,11 @@ def find_factors(run: Run) -> None:
     if straight:
         groups = [list(range(len(z)))]
     elif settings.modes is not None:
-        groups = given(settings.modes, len(z))
+        try:
+            settings.require_partition(len(z))
+        except ValueError as error:
+            raise FactorError(str(error)) from None
+        groups = [list(members) for members in settings.modes]
     else:
         groups = group(shared, settings.count)
     order = [j for members in groups for j in members]
@@ -45,9 +51,31 @@ def find_factors(run: Run) -> None:
             "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
             "names": [WHOLE] if straight else names(groups, z, found["vertices"], norm, centre),
             "overlap": between(shared, groups).tolist(),
+            "ignored": _ignored(run.config) if straight else [],
         }
     )
     directory.log("found", factors=len(groups), largest=max(map(len, groups)))
+
+
+def _ignored(config: Config) -> list[str]:
+    """Return the given settings that only exponentials have."""
+    given = {
+        "factors.count": config.factors.count is not None,
+        "factors.modes": config.factors.modes is not None,
+        "modes.norm": "norm" in config.modes.model_fields_set,
+        "modes.sparsity": config.modes.sparsity != "auto",
+        "networks.paper": config.networks.paper,
+        "evaluation.baselines": config.evaluation.baselines,
+    }
+    return [name for name, is_given in given.items() if is_given]
+
+
+def _warnings(run: RunDirectory) -> list[StageWarning]:
+    if not (ignored := run.factors.read_if_written().get("ignored")):
+        return []
+    has = "has" if len(ignored) == 1 else "have"
+    sentence = f"{', '.join(ignored)} {has} no effect, because straight lines have one factor and learn no networks"
+    return [StageWarning(sentence)]
 
 
 STAGE = Stage(
@@ -57,4 +85,5 @@ STAGE = Stage(
     run=find_factors,
     results=lambda run: [run.factors.path],
     rewrites=lambda run: [run.modes.path],
+    warnings=_warnings,
 )

@@ -39,6 +39,7 @@ def measure_generalisation(run: Run) -> None:
         ended = ~found.stuck[-1]
         facts = {
             "held_out": len(found.index),
+            "maps": sorted(set(found.maps)),
             "steps": int(found.steps.max()),
             "counts": found.counts[different],
             **{name: [summary(each) for each in rows[different]] for name, rows in away.items()},

@@ -193,6 +193,8 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         data = known
     elif source and known and (changes := _changes(known, data)):
         show(f"data: {changes}; all stages from ingest on run again")
+    for sentence in run.config.ineffective:
+        show(f"{sentence}, so it has no effect")
     if unused := run.config.unused:
         show(
             f"{', '.join(unused)}: not used any more; to make these studies of a finished run, use python -m "

@@ -41,7 +41,7 @@ SECTIONS = {
     "stages",
     "configuration",
 }
-CONFIG = '[collection]\n[export]\ntitle = "Sphere & Co <b>"\ndescription = "Made up."\n'
+CONFIG = '[collection]\n[modes]\ncount = 4\n[export]\ntitle = "Sphere & Co <b>"\ndescription = "Made up."\n'
 VOID = {"br", "hr", "img", "input", "link", "meta"}
 
 

@@ -43,12 +43,25 @@ def test_every_example_is_a_configuration_and_what_is_kept_of_it_says_the_same(p
         ("[export]", "[factors]\nmodes = [[0], []]\n[export]", "factors.modes.1"),
         ("[export]", "[factors]\nmodes = [[0, -1]]\n[export]", "factors.modes.0.1"),
         ("[export]", "[factors]\ncount = 2\nmodes = [[0]]\n[export]", "either count or modes"),
+        (
+            "[export]",
+            "[modes]\ncount = 3\n[factors]\nmodes = [[5, 4, 3]]\n[export]",
+            "there is no mode 3, 4, 5; these modes are in no factor: 0, 1, 2. There are 3 modes, counted from 0 to 2",
+        ),
+        ("[export]", "[modes]\ncount = 3\n[factors]\ncount = 4\n[export]", "count = 4 is more than modes.count = 3"),
     ],
 )
 def test_a_faulty_setting_is_named(old: str, new: str, says: str) -> None:
     assert old in TINY
     with pytest.raises(ConfigError, match=f"here.toml(.|\n)*{says}"):
         parse(TINY.replace(old, new, 1), "here.toml")
+
+
+def test_settings_that_need_others_are_told() -> None:
+    alone = TINY.replace("[export]", '[export]\nup = "+z"', 1).replace("baselines = true", "", 1)
+    needs = ["evaluation.grid_nodes needs evaluation.baselines", "export.up needs export.faces"]
+    assert parse(alone, "here.toml").ineffective == needs
+    assert parse(TINY.replace("[export]", '[export]\nup = "+z"\nfaces = "+x"', 1), "here.toml").ineffective == []
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import trimesh
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.triangle_mesh import TriangleMesh
-from shapespace.training.space.factors import FactorError, between, given, group, overlap
+from shapespace.training.space.factors import FactorError, between, group, overlap
 
 #: Which of three regions each of seven modes moves.
 REGIONS = [1, 0, 1, 2, 0, 1, 2]
@@ -118,20 +118,3 @@ def test_overlap_of_factors_is_the_average_over_pairs_of_modes(modes, norm):
     assert found[0, 1] == found[1, 0] == pytest.approx(shared[np.ix_([0, 2, 5], [1, 4])].mean())
     assert found[2, 2] == pytest.approx(shared[np.ix_([3, 6], [3, 6])].mean())
     assert found.diagonal().min() > 10 * found[~np.eye(3, dtype=bool)].max()
-
-
-def test_given_factors_stay_in_their_order():
-    assert given([[2, 0], [1]], 3) == [[2, 0], [1]]
-
-
-@pytest.mark.parametrize(
-    ("factors", "says"),
-    [
-        ([[0, 1], [3]], "there is no mode 3; these modes are in no factor: 2"),
-        ([[0, 1, 2], [1]], "listed more than once: 1"),
-        ([[5, 4, 3]], "no mode 3, 4, 5; these modes are in no factor: 0, 1, 2. There are 3 modes, counted from 0 to 2"),
-    ],
-)
-def test_given_factors_that_are_no_partition_are_refused(factors, says):
-    with pytest.raises(FactorError, match=says):
-        given(factors, 3)

@@ -9,6 +9,7 @@ import pytest
 import shapespace
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import parse
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run
@@ -23,7 +24,11 @@ mirror = false
 geometry = "{geometry}"
 count = {count}
 
+[factors]
+count = 2
+
 [evaluation]
+baselines = true
 reconstructions = 2
 
 [export]
@@ -53,6 +58,7 @@ def test_a_straight_line_model_is_served_without_training(
     said: list[str] = []
     assert execute(run, show=said.append)
     assert not run.directory.networks()
+    assert any("factors.count, evaluation.baselines have no effect" in sentence for sentence in said)
     lines, scale = run.collection.lines, run.collection.scale
     model = shapespace.load(run.bundle)
     assert [factor.name for factor in model.manifest.factors] == ["whole shape"]
@@ -60,6 +66,10 @@ def test_a_straight_line_model_is_served_without_training(
     assert model.manifest.exponential_steps == (1 if geometry == "vertices" else None)
     size = np.ptp(model.decode(np.zeros(2)), axis=0).max()
     if examples:
+        report = write_report(run.directory).read_text(encoding="utf-8")
+        assert "Straight lines learn no networks" in report
+        assert "R²" not in report
+        assert "SPGA" not in report
         # Memory brings training shapes back that two straight lines do not have.
         found = [model.decode(code) for code in run.collection.codes]
         errors = [np.abs(align(shape, near) - near).max() / size for shape, near in zip(shapes, found, strict=True)]

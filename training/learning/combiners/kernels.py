@@ -79,9 +79,8 @@ class KernelCorrection(Correction):
         sizes = sorted({min(most, known) for most in LIMITS.functions})
         for k, most in enumerate(sizes, 1):
             fitted = [copy(patch) for patch in patches]
-            for patch in progress(
-                fitted, f"learning how factors join, {k} of at most {len(sizes)}", "part", len(fitted)
-            ):
+            title = "learning how factors join" + (f", {k} of at most {len(sizes)}" if sizes[1:] else "")
+            for patch in progress(fitted, title, "part", len(fitted)):
                 patch.fit(pairs, others, own.slopes, coordinates, most, LIMITS.rank)
             if best and _error(best) - _error(fitted) < LIMITS.unseen:
                 break
