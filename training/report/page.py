@@ -161,8 +161,9 @@ def _geometry(choice: dict[str, Any]) -> str:
     )
     if not others:
         return f"{found}. The other maps had no mean shape."
+    beside = " and ".join(filter(None, (", ".join(others[:-1]), others[-1])))
     return (
-        f"{found}, beside {', '.join(others)}. A cheaper map is taken if its error is at most 2 % above the best "
+        f"{found}, beside {beside}. A cheaper map is taken if its error is at most 2 % above the best "
         "straight line, and at most 5 % above exponentials. The errors below are of other left-out shapes."
     )
 
