@@ -5,10 +5,12 @@ import itertools
 import numpy as np
 
 from shapespace.coordinates.nric import WeightedNorm
+from shapespace.training.learning.naming import NamingError, bundle_names
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.factor_names import names
 from shapespace.training.space.factors import FactorError, between, group, overlap
+from shapespace.training.space.shell_collection import names_of
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 #: Name of the factor of a straight-line model.
@@ -17,8 +19,8 @@ WHOLE = "whole shape"
 
 def find_factors(run: Run) -> None:
     """Write ``factors.json``; of meshes also ``modes.npz``, where each factor's latents are a range, as in bundles.
-    Dense modes of straight lines are one factor. Raises FactorError if there are fewer modes than factors, or if the
-    given factors are no partition of the modes.
+    Dense modes of straight lines are one factor. Raises FactorError if there are fewer modes than factors, if the given
+    factors are no partition of the modes, or if ``export.names`` has a name that is not there.
     """
     directory = run.directory
     if run.by_design:
@@ -46,15 +48,26 @@ def find_factors(run: Run) -> None:
     ordered["rank"] = np.array(order)
     directory.modes.write(**found | ordered)
     starts = np.cumsum([0, *map(len, groups)])
+    ranges = [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())]
+    named = [WHOLE] if straight else names(groups, z, found["vertices"], norm, centre)
+    _require_names(dict(zip(named, ranges, strict=True)), run.config)
     directory.factors.write(
         {
-            "factors": [list(range(a, b)) for a, b in itertools.pairwise(starts.tolist())],
-            "names": [WHOLE] if straight else names(groups, z, found["vertices"], norm, centre),
+            "factors": ranges,
+            "names": named,
             "overlap": between(shared, groups).tolist(),
             "ignored": _ignored(run.config) if straight else [],
         }
     )
     directory.log("found", factors=len(groups), largest=max(map(len, groups)))
+
+
+def _require_names(factors: dict[str, list[int]], config: Config) -> None:
+    """Refuse ``export.names`` that are not there now, rather than after hours, when the bundle is written."""
+    try:
+        bundle_names(factors, names_of(factors), config.export)
+    except NamingError as error:
+        raise FactorError(str(error)) from None
 
 
 def _ignored(config: Config) -> list[str]:

@@ -9,6 +9,7 @@ import trimesh
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import parse
+from shapespace.training.space.factors import FactorError
 from shapespace.training.stages.ingest import write_reference
 from shapespace.training.stages.mean import MeanError, find_mean
 from shapespace.training.stages.run import STAGES
@@ -82,3 +83,7 @@ def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     STAGES["factors"].run(run)
     assert run.directory.factors.read()["factors"] == [[0, 1, 2], [3, 4], [5, 6, 7]]
     assert run.directory.modes.read()["rank"].tolist() == [2, 5, 7, 1, 0, 3, 4, 6]
+    source += '[export.names]\nhead = "top"\n'
+    run = Run(tmp_path, parse(source, "balls.toml"), source, tmp_path / "models")
+    with pytest.raises(FactorError, match=r"export.names has 'head', .* There are \".*\", \""):
+        STAGES["factors"].run(run)
