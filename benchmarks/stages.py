@@ -71,8 +71,10 @@ modes. The last column has the exponent p, if the time grows as n^p. Stages belo
 
 {seconds}
 
-No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core. The
-largest process takes {memory}. A [cluster](../how-to/cluster.md) computes the samples. Other stages run on one machine,
+No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core
+and {gigabytes:.1f} GB. The largest process takes {memory}.
+
+A [cluster](../how-to/cluster.md) computes the samples. Other stages run on one machine,
 because they are short or their steps need all shapes. `python -m benchmarks.stages --people` measures this.
 
 """
@@ -244,6 +246,8 @@ def people_section(rows: list[dict[str, Any]]) -> str:
         stage: last["seconds"][stage] * (MORE_PEOPLE / last["size"]["shapes"]) ** power
         for stage, power in exponents.items()
     }
+    most = [(row["size"]["shapes"], row["megabytes"]["most"]) for row in rows[-2:]]
+    line = np.polyfit([count for count, _ in most], [megabytes for _, megabytes in most], 1)
     memory = ", ".join(f"{row['megabytes']['most']:.0f} MB with {row['size']['shapes']} shapes" for row in rows)
     size = Size(**first["size"])
     return PEOPLE.format(
@@ -256,6 +260,7 @@ def people_section(rows: list[dict[str, Any]]) -> str:
         fastest=max(exponents.values()),
         more=MORE_PEOPLE,
         hours=sum(more.values()) / 3600,
+        gigabytes=float(np.polyval(line, MORE_PEOPLE)) / 1000,
     )
 
 
