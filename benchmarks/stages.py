@@ -59,7 +59,7 @@ Times are [CPU time](../reference/glossary.md#cpu-time), without the time to sta
   The defaults are 4000 and 1000.
 - Meshes of more than 20,000 vertices are first thinned by many collapses at once.
 
-{people}The collections are capsules that bend and bulge. `python -m benchmarks.stages` trains on
+{people}The collections of the first table are capsules that bend and bulge. `python -m benchmarks.stages` trains on
 them with one BLAS thread, and writes this page from `runs/growth.json`. {measured}
 """
 
@@ -247,7 +247,7 @@ def people_section(rows: list[dict[str, Any]]) -> str:
         for stage, power in exponents.items()
     }
     most = [(row["size"]["shapes"], row["megabytes"]["most"]) for row in rows[-2:]]
-    line = np.polyfit([count for count, _ in most], [megabytes for _, megabytes in most], 1)
+    trend = np.polyfit([count for count, _ in most], [megabytes for _, megabytes in most], 1)
     memory = ", ".join(f"{row['megabytes']['most']:.0f} MB with {row['size']['shapes']} shapes" for row in rows)
     size = Size(**first["size"])
     return PEOPLE.format(
@@ -260,7 +260,7 @@ def people_section(rows: list[dict[str, Any]]) -> str:
         fastest=max(exponents.values()),
         more=MORE_PEOPLE,
         hours=sum(more.values()) / 3600,
-        gigabytes=float(np.polyval(line, MORE_PEOPLE)) / 1000,
+        gigabytes=float(np.polyval(trend, MORE_PEOPLE)) / 1000,
     )
 
 
