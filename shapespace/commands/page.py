@@ -47,7 +47,7 @@ def page(model: str, out: Path, force: bool) -> int:
         write(out / name, content)
     size = sum(map(len, files.values())) / 1e6
     print(f"{near(out)}: {len(files)} files, {size:.1f} MB. Any web server can show them, such as", file=sys.stderr)
-    print(f"python -m http.server --bind 127.0.0.1 --directory {near(out)}", file=sys.stderr)
+    print(f"python -m http.server 8080 --bind 127.0.0.1 --directory {near(out)}", file=sys.stderr)
     return 0
 
 

@@ -368,7 +368,7 @@ class _Fit:
         shape: Shape,
     ) -> tuple[FitStatus, str]:
         """Return how the fit ended, and the reason in words."""
-        shares = f"{explained:.0%} of the scan lie at the model, {seen:.0%} of the model at the scan"
+        shares = f"{explained:.0%} of the scan is near the model, and {seen:.0%} of the model is near the scan"
         if self.ended or shape.diagnostics.status is Status.DEADLINE:
             status = FitStatus.DEADLINE
             reason = f"The time ended before the fit converged: {shares} so far. Give fewer points or a coarser scan."
@@ -377,8 +377,12 @@ class _Fit:
             reason = f"Only {shares}: the scan is not a shape of this model, or the search failed."
             if mirrored is not None and mirrored < SETTINGS.mirrored:
                 reason += " Its mirror image fits much better: change the sign of one coordinate."
-            elif not self.constraints.partial:
-                reason += " If it shows a part only, set the option `partial`. Otherwise give three landmarks."
+            else:
+                if not self.constraints.partial:
+                    reason += " If it shows a part only, set the option `partial`."
+                if not self.constraints.free:
+                    reason += " If its size may differ from the model's, set scale=free."
+                reason += " Three landmarks also help."
         elif rival is not None:
             status = FitStatus.AMBIGUOUS
             apart = self._apart(rival, state)

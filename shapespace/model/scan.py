@@ -125,6 +125,8 @@ def scan_of(points: FloatArray, faces: IntArray, rng: np.random.Generator) -> Sc
         raise InvalidScanError(
             f"The faces name points {faces.min()} to {faces.max()}, but there are {len(points)}, counted from 0."
         )
+    if not np.ptp(points, axis=0).any():
+        raise InvalidScanError("All points of the scan are the same. Give points from all over the surface.")
     if not np.ptp(points, axis=0).max() > np.finfo(np.float32).tiny:
         raise InvalidScanError("The scan is too small for its numbers. Give it in smaller units, such as millimetres.")
     # Strays may lie anywhere. Neither flatness nor the spacing of samples may depend on strays.

@@ -25,7 +25,7 @@ from shapespace.model.fit import Fitter
 from shapespace.model.fit_result import Fitted
 from shapespace.model.inputs import MeshLike, ScanLike, listed_targets, matched, points_and_faces
 from shapespace.model.jacobian import NetworkDerivatives, shape_jacobian
-from shapespace.model.latent_space import Bounds, Codes, Distribution, NotFiniteError, WrongLengthError
+from shapespace.model.latent_space import Bounds, Codes, Distribution, LatentError, NotFiniteError, WrongLengthError
 from shapespace.model.options import EditOptions, EncodeOptions, FitOptions, Target
 from shapespace.model.shape import Quality, Shape
 from shapespace.model.vertex_uncertainty import require_covariance, vertex_uncertainty
@@ -414,7 +414,8 @@ class ShapeModel:
             temperature: factor of the differences from the mean of the population; only for "population".
 
         Raises:
-            LatentError: the temperature is negative, not finite, or so large that the numbers overflow.
+            LatentError: the temperature is negative, not finite, so large that the numbers overflow, or for another
+                distribution.
 
         >>> import shapespace
         >>> model = shapespace.load("models/figure")
@@ -423,6 +424,8 @@ class ShapeModel:
         ((3, 20), True)
         """
         if Distribution(distribution) is not Distribution.POPULATION:
+            if temperature != 1:
+                raise LatentError('temperature is only for the distribution "population".')
             return self.latents.sample(count, seed, Distribution(distribution))
         if not 0 <= temperature < np.inf:
             raise NotFiniteError(f"temperature is {temperature:g}. Give a finite number of at least 0.")

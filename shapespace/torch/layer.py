@@ -133,6 +133,8 @@ class ShapeLayer(nn.Module):
 
     def forward(self, codes: Tensor) -> Tensor:
         """Return positions (n, V, 3) of codes (n, m)."""
+        if not isinstance(codes, Tensor):
+            raise TypeError(f"codes are {type(codes).__name__}, not a tensor: convert them by torch.as_tensor(codes)")
         if codes.ndim != 2 or codes.shape[1] != len(self.names):
             raise ValueError(f"codes must be (n, {len(self.names)}), not {tuple(codes.shape)}")
         if codes.dtype != self.lower.dtype:

@@ -311,6 +311,7 @@ def test_what_is_no_such_shape_is_told_so(request: pytest.FixtureRequest, name: 
     solids = {"ball": trimesh.creation.icosphere(4, 0.6), "box": trimesh.creation.box((1, 0.5, 1.5)).subdivide_loop(5)}
     found = request.getfixturevalue(name).fit_scan((solids[solid].vertices, solids[solid].faces))
     assert found.status is FitStatus.POOR
+    assert "set scale=free" in found.reason
     assert found.explained < 0.9
     assert "not a shape of this model" in found.reason
 
@@ -394,7 +395,7 @@ def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel)
         (CLOUD[:, :2], {}, "(N, 3)"),
         (np.where(np.arange(50)[:, None] == 3, np.nan, CLOUD), {}, "Point 3"),
         (CLOUD * [1, 0, 1], {}, "in a plane"),
-        (np.ones((50, 3)), {}, "too small"),
+        (np.ones((50, 3)), {}, "are the same"),
         (np.concatenate([np.zeros((990, 3)), CLOUD[:10]]), {}, "at one place"),
         (CLOUD, {"noise": 1e200}, "noise"),
         (CLOUD, {"scale": "free", "landmarks": [Landmark(5, [0, 0, 0])] * 3}, "at one place"),

@@ -7,7 +7,7 @@ import trimesh
 from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.model.correspondence import InvalidMeshError
-from shapespace.model.latent_space import NotFiniteError
+from shapespace.model.latent_space import LatentError, NotFiniteError
 from shapespace.model.population import Population
 from shapespace.model.posterior import Posterior, independent_share, patches_of
 from shapespace.model.shape_model import ShapeModel
@@ -163,6 +163,8 @@ def test_samples_of_the_population_have_its_moments(figure: ShapeModel) -> None:
     assert (codes > figure.upper).any(), "they are not truncated at the bounds"
     half = figure.sample(10, 1, "population", 0.5)
     np.testing.assert_allclose(half - population.mean, (codes[:10] - population.mean) / 2, atol=1e-6)
+    with pytest.raises(LatentError, match="only for"):
+        figure.sample(1, temperature=2)
     for temperature in (-1, np.inf, np.nan, 1e300):
         with pytest.raises(NotFiniteError):
             figure.sample(1, 1, "population", temperature)

@@ -73,3 +73,5 @@ def test_layer_refuses_codes_of_another_length(tiny: Path) -> None:
 def test_layer_refuses_codes_of_another_type_and_says_how_to_convert_them(tiny: Path) -> None:
     with pytest.raises(TypeError, match=r"float64, but the layer computes in torch\.float32.*layer\.double"):
         ShapeLayer(tiny)(torch.zeros(2, 3, dtype=torch.float64))
+    with pytest.raises(TypeError, match="ndarray, not a tensor"):
+        ShapeLayer(tiny)(np.zeros((2, 3), np.float32))
