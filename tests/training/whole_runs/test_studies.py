@@ -51,9 +51,10 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(pages, "MEASUREMENTS", tmp_path)
     results.write_page()
     page = (tmp_path / "results.md").read_text()
-    assert "| horse | 35, 20, 5 (1 – 7) |" in page
-    kernel = row["evaluation"]["fresh"]["r2"]["kernel"]["total"]
-    assert f"| horse | 0.8765 | 0.9981 | **{kernel:.4f}** |" in page, "the best is bold"
+    sizes, shapes = row["sizes"], row["ingest"]["shapes"]
+    assert f"| horse | {shapes}, {sum(sizes)}, {len(sizes)} ({min(sizes)} – {max(sizes)}) |" in page
+    one, kernel = (row["evaluation"]["fresh"]["r2"][model]["total"] for model in ("monolithic", "kernel"))
+    assert f"| horse | 0.8765 | {one:.4f} | **{kernel:.4f}** |" in page, "the best is bold"
     assert "yet: hand, faces, samba, makehuman, hippocampus." in page
     assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
     assert "## Number of samples" not in page, "nothing of what was not measured"
