@@ -193,13 +193,13 @@ def _prepare(run: Run, show: Callable[[str], None]) -> tuple[dict[str, dict[str,
         data = known
     elif source and known and (changes := _changes(known, data)):
         show(f"data: {changes}; all stages from ingest on run again")
-    for sentence in run.config.ineffective:
-        show(f"{sentence}, so it has no effect")
     if unused := run.config.unused:
         show(
             f"{', '.join(unused)}: not used any more; to make these studies of a finished run, use python -m "
             "benchmarks.studies in the repository"
         )
+    for sentence in run.config.ineffective:
+        show(f"{sentence}, so it has no effect")
     keys = stage_keys(run.config, json.dumps({name: facts["sha256"] for name, facts in data.items()}) if data else "")
     stamp = directory.stamp("ingest").read_if_written()
     changed = stamp.get("key") != keys["ingest"]["key"]
