@@ -50,8 +50,17 @@ PLACED |= {
     "validation",
 }
 #: Keys of evaluation.json that say how well networks follow exact shapes.
-OF_NETWORKS = {"r2", "r2_factors", "fresh", "limit", "correction", "variants", "validation"}
-OF_NETWORKS |= {"affine_samples", "vertex_error"}
+OF_NETWORKS = {
+    "r2",
+    "r2_factors",
+    "fresh",
+    "limit",
+    "correction",
+    "variants",
+    "validation",
+    "affine_samples",
+    "vertex_error",
+}
 #: Other keys of evaluation.json, in words.
 WORDS = {
     "affine_samples": "test codes of the affine sums",
@@ -110,9 +119,9 @@ def page(record: Record) -> str:
         modes_count=len(modes.get("vertices", ())),
         mode_charts=list(mode_charts(record)),
         explained={
-            kind: record.decomposition[key]
-            for kind, key in (("these modes" if straight else "SPGA", "explained"), ("PGA", "pga_explained"))
-            if key in record.decomposition and f"{'pga_' if kind == 'PGA' else ''}vertices" in modes
+            kind: record.decomposition[f"{prefix}explained"]
+            for kind, prefix in (("these modes" if straight else "SPGA", ""), ("PGA", "pga_"))
+            if f"{prefix}explained" in record.decomposition and f"{prefix}vertices" in modes
         },
         support_bar=colour_bar(ramp(NEUTRAL), "unchanged", "changes most"),
         factors=list(factor_cards(record, close)),

@@ -74,9 +74,9 @@ def advice(record: Record) -> Iterator[str]:
     given_count = record.config.get("modes", {}).get("count", "auto")
     room = given_count != "auto" and 1.5 * given_count < 0.8 * shapes
     if own < (1 - STILL_FALLS) * half and room:
-        more, fewer = map(coordinates, reversed(facts["counts"][-2:]))
+        fewer, more = facts["counts"][-2:]
         yield (
-            f"More modes: with {more} instead of {fewer.split()[0]}, the error on unseen shapes fell from "
+            f"More modes: with {coordinates(more)} instead of {fewer:g}, the error on unseen shapes fell from "
             f"{percent(half)} to {percent(own)}. Try modes.count = {round(1.5 * given_count)}."
         )
     error = record.evaluation.get("vertex_error", {}).get("mean", 0.0)
