@@ -49,10 +49,14 @@ class MeshCollection:
         """
         if name is None:
             return self.central
-        for known in (name, Path(name).stem):
-            if known in self.names:
-                return self.names.index(known)
-        raise IngestError(Fault("", f"no shape is called {name!r}", f"there are {', '.join(self.names[:8])} …"))
+        if (known := self._named(name)) not in self.names:
+            raise IngestError(Fault("", f"no shape is called {name!r}", f"there are {', '.join(self.names[:8])} …"))
+        return self.names.index(known)
+
+    def _named(self, given: str) -> str:
+        """Return the name of the shape that a user calls by its name or file; a name of no shape if there is none."""
+        by_file = {file: name for name, (file, _) in zip(self.names, self.places, strict=False)}
+        return given if given in self.names else by_file.get(given, Path(given).stem)
 
     def require_accepted(self, accepted: Sequence[str]) -> None:
         """Refuse shapes with a grave warning, unless the user accepts them by their names or files.
@@ -60,8 +64,7 @@ class MeshCollection:
         Raises:
             IngestError: with each such shape, or with a name that no shape has.
         """
-        by_file = {file: name for name, (file, _) in zip(self.names, self.places, strict=False)}
-        names = {name if name in self.names else by_file.get(name, Path(name).stem) for name in accepted}
+        names = {self._named(name) for name in accepted}
         if unknown := names - set(self.names):
             raise IngestError(Fault("", f"--accept: no shape is called {', '.join(sorted(unknown))}"))
         grave = [warning for warning in self.warnings if warning.grave and self.names[warning.shape] not in names]

@@ -207,6 +207,7 @@ def test_the_reference_gets_unit_area_and_the_scale_undoes_it(tmp_path: Path) ->
 def test_shapes_are_found_by_name(tmp_path: Path) -> None:
     found = read_collection(write(tmp_path))
     assert [found.index(name) for name in ("pose1", "pose2", "pose10")] == [0, 1, 2]
+    assert found.index("pose2.ply") == 1, "by its file"
     with pytest.raises(IngestError, match="no shape is called 'pose3'; there are pose1, pose2, pose10"):
         found.index("pose3")
     for shape in found.vertices:
