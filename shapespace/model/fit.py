@@ -47,7 +47,8 @@ class Fitter:
 
     While the result is poor, the fit makes further attempts (SETTINGS.attempts). A few steps pull unmatched parts of
     both sides together. Factors get the parts of other codes. Or the fit begins again with more rotations and with the
-    training shapes. A scan of a part may hide a limb, so there training shapes are compared with every result.
+    training shapes. A scan of a part may hide a limb, so there training shapes are compared with every result. Also for
+    a part, some steps look from the model to the scan as well.
     """
 
     def __init__(self, decoder: Decoder) -> None:
@@ -111,7 +112,10 @@ class _Fit:
             self.features = self.prepared.features(reconstruct)
             best, others = self._roughly(rough, QUICK)
             self._reach(PLACED)
-            near = self._insistently(rough, middle, self._solved(middle, best))
+            near = self._solved(middle, best)
+            if self.constraints.partial and not self._late:
+                near = self._from_both_sides(rough, middle, near)
+            near = self._insistently(rough, middle, near)
             if self.constraints.partial and not self._late:
                 near, others = self._with_memory(middle, near, others)
             self._reach(NEARLY)
@@ -221,6 +225,20 @@ class _Fit:
         if not self._late and self._is_poor(*middle.shares(found)):
             found = middle.with_moved_feature(found, self.features, SETTINGS.again_steps)
         return found
+
+    def _from_both_sides(self, rough: FitSearch, middle: FitSearch, state: FitState) -> FitState:
+        """Return the better of a fit to a part and of one whose shape also looked for the scan.
+
+        A part shows where the surface is, but not where it ends. A limb that is turned wrongly may come to rest where
+        all points are near it, although the rest of it sticks out. The scan pulls that rest back.
+        """
+        both = self._search(rough.reconstruct, self.scan, replace(self.constraints, partial=False), ROUGH)
+        begun = both.start(state.code, state.placement, state.shape)
+        if begun is None:
+            return state
+        found = self._solved(middle, both.run(begun, SETTINGS.both_steps, first=True))
+        rough.count += both.count
+        return min(state, found, key=lambda each: each.cost)
 
     def _insistently(self, rough: FitSearch, middle: FitSearch, state: FitState) -> FitState:
         """Return the best fit with solved shapes, after further attempts while it is poor."""

@@ -21,6 +21,7 @@ class ScanFitSettings:
         coarse_vertices, fine_vertices: number of vertices of each mesh that look for a nearest scan point.
         behind: in the last round, a second start takes part if it costs at most this multiple of the best.
         middle_steps, last_steps: steps with solved shapes, first with few points, then with all on the fine mesh.
+        both_steps: steps to a scan of a part with rough shapes that also look from the model to the scan.
         again_steps: further steps with few points after a feature has moved.
         attempts, attempts_of_part: attempts to improve a poor fit to a scan (of a part), one after another.
         attempt_steps: steps of each attempt,
@@ -47,6 +48,7 @@ class ScanFitSettings:
     behind: float = 1.5
     middle_steps: int = 8
     last_steps: int = 6
+    both_steps: int = 12
     again_steps: int = 10
     attempts: tuple[Attempt, ...] = (
         *2 * (Attempt.PULL, Attempt.EXCHANGE),

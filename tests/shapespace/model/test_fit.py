@@ -218,6 +218,15 @@ def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: Sha
     assert np.trace(found.covariance) > np.trace(whole.covariance)
 
 
+@pytest.mark.parametrize(("seed", "axis"), [(2, 0), (9, 2), (12, 0)])
+def test_no_limb_sticks_out_of_what_one_camera_sees(figure: ShapeModel, seed: int, axis: int) -> None:
+    # The points alone also suit a limb that is turned wrongly, because they do not say where the surface ends.
+    given = Moved.of(figure, seed)
+    found = figure.fit_scan(given.seen_from(axis), partial=True)
+    assert found.status is FitStatus.CONVERGED, found.reason
+    assert given.error(found) < 5e-4
+
+
 def test_a_fit_is_ambiguous_where_the_scan_says_little(figure: ShapeModel, plain: Plain) -> None:
     given, _ = plain(3)
     moved = np.linalg.norm(figure.jacobian(given.code)[:, :, figure.latents.names.index("left knee")], axis=1)
