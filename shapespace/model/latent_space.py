@@ -12,6 +12,8 @@ from shapespace.bundle.schema import Manifest
 from shapespace.counted import counted
 from shapespace.model.choice import Choice
 
+#: Fixed values farther outside the bounds are refused, in widths of the bounds: networks know nothing there.
+FAR = 100.0
 #: (n, m) codes as the networks take them; everything that identifies a shape is derived from this form.
 Codes = NDArray[np.float32]
 #: One of them (m,), and whether it is inside the bounds.
@@ -35,7 +37,7 @@ class OutOfBoundsError(LatentError):
 
 
 class InvalidFixedError(LatentError):
-    """Fixed coordinates that do not exist, or whose values are not finite."""
+    """Fixed coordinates that do not exist, or whose values are not finite or far outside the bounds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +147,14 @@ class LatentSpace:
         return codes[0], bool(inside[0])
 
     def fixed(self, values: Mapping[int, float] | None = None) -> Fixed:
-        """Check fixed coordinates, given as values by index, inside the bounds or not; raises InvalidFixedError."""
+        """Check values by index that coordinates keep, which may be outside the bounds. Raises InvalidFixedError."""
         values = values or {}
-        unknown = [index for index in values if not 0 <= index < self.dimension]
+        unknown = [index for index in values if index not in range(self.dimension)]
         if unknown:
+            name = str(unknown[0])
+            known = f" {name} is {self.names.index(name)}." if name in self.names else ""
             raise InvalidFixedError(
-                f"fixed names coordinate {unknown[0]}, but {self.model} has coordinates 0 to {self.dimension - 1}."
+                f"fixed names coordinate {name}, but {self.model} has coordinates 0 to {self.dimension - 1}.{known}"
             )
         mask = np.isin(np.arange(self.dimension), list(values))
         code = np.array([values.get(k, 0.0) for k in range(self.dimension)])
@@ -158,6 +162,14 @@ class LatentSpace:
             bad = np.flatnonzero(~np.isfinite(code.astype(np.float32)))
         if len(bad):
             raise InvalidFixedError(f"fixed[{bad[0]}] is not a finite number. Give finite numbers.")
+        outside = np.maximum(self.lower - code, code - self.upper)
+        far = np.flatnonzero(mask & ~self.periodic & (outside > FAR * self.width))
+        if len(far):
+            k = far[0]
+            raise InvalidFixedError(
+                f"fixed[{k}] ({self.names[k]}) is {code[k]:g}, far outside [{self.lower[k]:g}, {self.upper[k]:g}]. "
+                "Give a value nearer to these bounds."
+            )
         return Fixed(mask, np.where(mask, self.code(code.tolist())[0], np.float32(0)))
 
     def found(self, x: FloatArray, bounds: Bounds, fixed: Fixed) -> CheckedCode:

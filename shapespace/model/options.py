@@ -92,7 +92,8 @@ class SearchOptions:
     """Options that all searches for a code have. Enumerations may be given as plain strings.
 
     Attributes:
-        fixed: coordinates that keep a value, inside the bounds or not: values by index, from 0.
+        fixed: coordinates that keep a value, inside the bounds or up to 100 times their width outside: values by index,
+            from 0.
         samples: number of random codes to draw from the posterior, a Gaussian around the code with the ``covariance``
             of the answer.
         seed: seed of all random numbers. The same seed gives the same answer.

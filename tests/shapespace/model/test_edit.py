@@ -13,7 +13,7 @@ from shapespace.mesh.rigid_motion import Placement, weighted_change
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.edit_search import SETTINGS
-from shapespace.model.latent_space import InvalidFixedError, NotFiniteError
+from shapespace.model.latent_space import InvalidFixedError
 from shapespace.model.options import EditOptions, PriorKind, Target
 from shapespace.model.shape_model import ShapeModel
 
@@ -126,9 +126,15 @@ def test_what_is_fixed_is_kept_to_the_last_bit(model: ShapeModel) -> None:
         model.edit(CODE, targets, fixed={0: np.nan})
 
 
-def test_fixed_values_for_which_numbers_overflow_are_refused(figure: ShapeModel) -> None:
-    with pytest.raises(NotFiniteError, match="outside the bounds"):
-        figure.edit(np.zeros(20), {0: figure.vertices[0]}, fixed={0: 1e15})
+def test_fixed_values_far_outside_the_bounds_and_names_are_refused(figure: ShapeModel) -> None:
+    for fixed, says in (
+        ({0: 1e15}, r"fixed\[0\] \(.*\) is 1e\+15, far outside"),
+        ({7: -1e6}, r"fixed\[7\] \(left knee\) is -1e\+06, far outside"),
+        ({"left knee": 0.1}, "coordinate left knee, but .* 0 to 19. left knee is 7"),
+        ({"left kne": 0.1}, "coordinate left kne, but .* 0 to 19.$"),
+    ):
+        with pytest.raises(InvalidFixedError, match=says):
+            figure.edit(np.zeros(20), {0: figure.vertices[0]}, fixed=fixed)
 
 
 def test_targets_count_by_their_sigma(model: ShapeModel) -> None:
