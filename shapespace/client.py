@@ -227,7 +227,7 @@ class Client:
         return Interpolation(self, answer["id"], answer["frames"], quality)
 
     def encode(
-        self, name: str, mesh: Mesh | bytes | Path, format: str | None = None, **options: Unpack[EncodeParameters]
+        self, name: str, mesh: Mesh | bytes | Path | str, format: str | None = None, **options: Unpack[EncodeParameters]
     ) -> dict[str, Any]:
         """Find the code whose shape comes closest to a mesh in correspondence, in any rigid pose.
 
@@ -249,7 +249,7 @@ class Client:
     def fit(
         self,
         name: str,
-        scan: Mesh | ArrayLike | bytes | Path,
+        scan: Mesh | ArrayLike | bytes | Path | str,
         format: str | None = None,
         **options: Unpack[FitParameters],
     ) -> dict[str, Any]:
@@ -264,7 +264,7 @@ class Client:
         Returns:
             ``latent``, ``covariance``, ``placement``, ``status``, ``reason`` and more.
         """
-        if isinstance(scan, bytes | Path | Mesh):
+        if isinstance(scan, bytes | Path | str | Mesh):
             content, format = _file(scan, format)
         else:
             content, format = _npz(vertices=np.asarray(scan, dtype=np.float64)), "npz"
@@ -389,13 +389,14 @@ def _json(value: Mapping[Any, Any] | None) -> str | None:
     return None if value is None else json.dumps(value, default=lambda array: array.tolist())
 
 
-def _file(mesh: Mesh | bytes | Path, format: str | None) -> tuple[bytes, str | None]:
+def _file(mesh: Mesh | bytes | Path | str, format: str | None) -> tuple[bytes, str | None]:
     """Return the content of a mesh file, and its format if that is known."""
     if isinstance(mesh, Mesh):
         return _npz(vertices=mesh.vertices, faces=mesh.faces), "npz"
-    if isinstance(mesh, Path):
-        return mesh.read_bytes(), format or mesh.suffix.lstrip(".")
-    return mesh, format
+    if isinstance(mesh, bytes):
+        return mesh, format
+    path = Path(mesh)
+    return path.read_bytes(), format or path.suffix.lstrip(".")
 
 
 def _numbers(values: ArrayLike) -> Any:

@@ -38,6 +38,7 @@ _HEADERS = {
             "`inside_bounds`, `model`, `quality`."
         ),
         "Model-Version": "Version of the model that answers.",
+        "Shape-Color": "JSON, with `color`: `quantity`, `range` of the legend, `map`.",
         "Server-Timing": "Milliseconds by stage: `network`, `reconstruct`, `encode`.",
     }.items()
 }
@@ -98,13 +99,19 @@ def describe(app: FastAPI, routers: Iterable[APIRouter]) -> None:
     }
 
 
-def binary(media_types: Mapping[str, str], description: str, *, cached: bool = True) -> dict[int | str, dict[str, Any]]:
-    """Describe an answer in one of several binary formats, with an entity tag if ``cached``."""
+def binary(
+    media_types: Mapping[str, str], description: str, *, cached: bool = True, coloured: bool = False
+) -> dict[int | str, dict[str, Any]]:
+    """Describe an answer in one of several binary formats, with an entity tag if ``cached``.
+
+    An answer that may be ``coloured`` has a header with the legend.
+    """
     schema = {"schema": {"type": "string", "format": "binary"}}
     # Generators of clients take the first type that they know, and read others than plain bytes as JSON or not at all.
     ordered = sorted({*media_types.values()} - {"application/json"}, key=lambda name: (name != OCTET_STREAM, name))
     others = dict.fromkeys(ordered, schema)
-    headers = {name: header for name, header in _HEADERS.items() if cached or name != "ETag"}
+    left_out = {*(() if cached else ("ETag",)), *(() if coloured else ("Shape-Color",))}
+    headers = {name: header for name, header in _HEADERS.items() if name not in left_out}
     answers: dict[int | str, dict[str, Any]] = {
         200: {"description": description, "content": others, "headers": headers}
     }
@@ -115,14 +122,9 @@ def binary(media_types: Mapping[str, str], description: str, *, cached: bool = T
 
 def mesh_answers(description: str) -> dict[int | str, dict[str, Any]]:
     """Describe a mesh in one of the formats of a shape."""
-    answers = binary({name: format.media_type for name, format in SHAPE_FORMATS.items()}, description)
+    media_types = {name: format.media_type for name, format in SHAPE_FORMATS.items()}
+    answers = binary(media_types, description, coloured=True)
     answers[200]["model"] = MeshAnswer
-    answers[200]["headers"] |= {
-        "Shape-Color": {
-            "description": "JSON, with `color`: `quantity`, `range` of the legend, `map`.",
-            "schema": {"type": "string"},
-        }
-    }
     return answers
 
 

@@ -29,8 +29,9 @@ _CACHED = {"network": 0.0, "reconstruct": 0.0, "encode": 0.0}
 
 
 def file_headers(written: EncodedFile, filename: str = "") -> dict[str, str]:
-    """Return headers with the diagnostics of a file, if there are any, and its name."""
-    headers = {"Shape-Diagnostics": dump_json(written.diagnostics).decode()} if written.diagnostics else {}
+    """Return headers with the diagnostics and the legend of a file, if there are any, and its name."""
+    told = {"Shape-Diagnostics": written.diagnostics, "Shape-Color": written.legend}
+    headers = {name: dump_json(each).decode() for name, each in told.items() if each}
     return headers | ({"Content-Disposition": f'inline; filename="{filename}"'} if filename else {})
 
 
@@ -53,8 +54,6 @@ async def cached_response(
         service.answers.keep(tag, written)
         service.metrics.timed(written.seconds)
     headers = {**cache_headers(tag), **file_headers(written, filename), **_timing(_CACHED if kept else written.seconds)}
-    if written.facts:
-        headers["Shape-Color"] = dump_json(written.facts).decode()
     return Response(written.content, headers=headers, media_type=media_type)
 
 

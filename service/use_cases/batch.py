@@ -61,13 +61,15 @@ class EncodedFile:
         content: the bytes of a small file, the pieces of a large one.
         seconds: time by stage; ``encode`` ends with the first piece.
         diagnostics: of the shape, or a summary over all shapes; None if no shape was reconstructed.
-        facts: what the writer of the format reports about the file, as the legend of its colours.
+        facts: what the writer of the format reports about the file.
+        legend: of its colours; empty without colours.
     """
 
     content: bytes | PiecewiseFile
     seconds: Timings
     diagnostics: Mapping[str, Any] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    legend: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Batch:

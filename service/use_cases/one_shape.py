@@ -64,7 +64,7 @@ def place_vertices(vertices: NDArray[np.floating], place: Placement | None) -> F
 
 
 async def shape_file(caller: Caller, model: ShapeModel, wanted: ShapeRequest) -> EncodedFile:
-    """Return one shape as a file; the legend of its colours, if there are any, is the file's ``facts``.
+    """Return one shape as a file.
 
     Raises NotFiniteError or ModelFailedError if the model has no shape for the code.
     """
@@ -93,7 +93,8 @@ async def shape_file(caller: Caller, model: ShapeModel, wanted: ShapeRequest) ->
         encoding = {"encode": time.perf_counter() - began}
         record_stages(encoding)
         seconds = total_seconds(shape.seconds for shape in found) | encoding
-        return EncodedFile(content, seconds, asdict(found[0].diagnostics), colouring.legend if colouring else {})
+        legend = colouring.legend if colouring else {}
+        return EncodedFile(content, seconds, asdict(found[0].diagnostics), legend=legend)
 
     async with caller.admit() as call:
         return await call.run(make)

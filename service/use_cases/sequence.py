@@ -98,19 +98,21 @@ async def sequence_file(
         vertices, whole = found.vertices[:number], model.mesh(mesh)
         surface = with_topology(model.decoder.surface(mesh), topology)
 
+        colourings: list[Colouring] = []
+
         def encode() -> tuple[Iterator[Buffer], dict[str, Any]]:
-            colourings: list[Colouring] = []
             if colour_by:
                 against = found.vertices[-1].astype(np.float64)
                 if colour_by.against is None:
                     against = model.decoder.reference_shape(mesh).vertices
-                colourings = Colouring.of_frames(colour_by.quantity, vertices, against, whole.connectivity)
+                colourings.extend(Colouring.of_frames(colour_by.quantity, vertices, against, whole.connectivity))
             each = found.diagnostics[:number]
             shown = vertices, each, whole.faces, animation.positions, codes[:number], surface, fps, colourings
             frames = Frames(*shown, animation.name or "animation")
             return encode_frames(frames, format)
 
-        return await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))
+        written = await work.write(encode, found.seconds, summarise(found.diagnostics[:number]))
+        return replace(written, legend=colourings[0].legend) if colourings else written
 
 
 async def sequence_lines(

@@ -16,7 +16,7 @@ from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.triangle_mesh import diagonal
 
 #: Up to this number of frames, each frame is a morph target. Longer animations have a basis of at most this number of
-#: targets, because every target has a weight in every frame, and viewers keep targets in a texture of 256 layers.
+#: vectors, because every target has a weight in every frame, and viewers keep targets in a texture of 256 layers.
 DENSE_FRAMES = 64
 #: Largest distance of a vertex from its position, as a fraction of the bounding box's diagonal, that the basis aims at.
 BASIS_TOLERANCE = 1e-4
@@ -54,9 +54,9 @@ def animated_glb(
     """Encode shapes (n, V, 3) as an animation whose key k, at ``k / fps`` seconds, shows frame k.
 
     Frame 0 is the mesh at rest. Up to DENSE_FRAMES frames, each later frame is a target, so that keys are exact to
-    float32. Longer sequences use the leading singular vectors of the displacements from frame 0 as targets. Weights are
-    between 0 and 1. Targets are named "frame 1", "frame 2", … or "component 1", …. The vertex error is measured on the
-    written values, and is in ``asset.extras`` too.
+    float32. Longer sequences use the leading singular vectors of the displacements from frame 0 as targets, unless
+    these would be as many as the frames. Weights are between 0 and 1. Targets are named "frame 1", "frame 2", … or
+    "component 1", …. The vertex error is measured on the written values, and is in ``asset.extras`` too.
 
     Positions are float32. Displacements are computed block by block, because together they can take hundreds of
     megabytes.
@@ -73,9 +73,8 @@ def animated_glb(
     rest = frames[0].astype(np.float64)
     weights: FloatArray
     fit: FloatArray
-    if len(frames) <= DENSE_FRAMES:
-        weights = fit = np.eye(len(frames) - 1)
-    else:
+    dense = len(frames) <= DENSE_FRAMES
+    if not dense:
         corners = np.stack([frames.min(axis=(0, 1)), frames.max(axis=(0, 1))]).astype(np.float64)
         weights = _basis_weights(frames, BASIS_TOLERANCE * float(diagonal(corners)))
         fit = np.asarray(np.linalg.pinv(weights), np.float64)
@@ -83,6 +82,9 @@ def animated_glb(
         both = (weights < 0).any(axis=0)
         weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
         fit = np.concatenate([fit, -fit[both]])
+        dense = len(fit) >= len(frames) - 1
+    if dense:
+        weights = fit = np.eye(len(frames) - 1)
     keys = np.concatenate([np.zeros((1, len(fit))), weights]).astype(np.float32)
     targets = np.empty((len(fit), *rest.shape), np.float32)
     error = 0.0
@@ -95,7 +97,7 @@ def animated_glb(
     document = GltfBuilder(rest, faces, first, surface, name=name)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
-        kind = "frame" if len(frames) <= DENSE_FRAMES else "component"
+        kind = "frame" if dense else "component"
         names = [f"{kind} {k}" for k in range(1, len(targets) + 1)]
         document.add_targets(targets, normal_targets, names, _colour_targets(colourings, fit) if first else None)
         times = document.add(np.arange(len(frames)) / fps, bounds=True)

@@ -20,7 +20,7 @@ from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, Search
 from shapespace.model.fit_settings import SETTINGS, Attempt
 from shapespace.model.fit_uncertainty import Doubt, posterior_of
 from shapespace.model.latent_space import Bounds
-from shapespace.model.options import FitOptions
+from shapespace.model.options import FitOptions, ScaleChoice
 from shapespace.model.part_exchange import SHORT, ShapeJudge
 from shapespace.model.placement import MORE, QUICK, THOROUGH, PlacementEffort, StartPlacement, start_placements
 from shapespace.model.posterior import Posterior
@@ -94,9 +94,13 @@ class _Fit:
         self.progress, self.done = progress, 0.0
         self.decoder, self.prepared, self.options, self.deadline = prepared.decoder, prepared, options, deadline
         self.searching = deadline and deadline.for_searching()
-        self.points, self.unit = points, self.decoder.manifest.scale
+        self.points, self.unit, self.stretch = points, self.decoder.manifest.scale, 1.0
         self.scan = scan_of(np.asarray(points, np.float64) / self.unit, faces, np.random.default_rng(options.seed))
-        self.constraints = FitConstraints.of(options, self.decoder)
+        if options.scale is ScaleChoice.FREE:
+            # In the search a scan in any units has about the size of a shape.
+            self.stretch = self.scan.size / self._usual_size(prepared.starts)
+            self.scan, self.unit = replace(self.scan, points=self.scan.points / self.stretch), self.unit * self.stretch
+        self.constraints = FitConstraints.of(options, self.decoder, self.unit)
 
     def __call__(self) -> Fitted:
         fixed = self.options.fixed
@@ -149,9 +153,11 @@ class _Fit:
             self.done = share
             self.progress(share)
 
+    def _usual_size(self, starts: StartShapes) -> float:
+        return float(np.median(np.sqrt(starts.shapes.var(axis=1).sum(axis=1))))
+
     def _require_units(self) -> None:
-        sizes = np.sqrt(self.starts.shapes.var(axis=1).sum(axis=1))
-        ratio = self.scan.size / float(np.median(sizes))
+        ratio = self.scan.size / self._usual_size(self.starts)
         if not 1 / (SETTINGS.units_of_part if self.options.partial else SETTINGS.units) <= ratio <= SETTINGS.units:
             raise InvalidScanError(
                 f"The scan is about {ratio:.3g} times as large as the shapes of {self.decoder.manifest.name}. "
@@ -345,7 +351,7 @@ class _Fit:
         shape = decoder.shape(code, inside, MeshChoice.FINE, self.deadline)
         there = state.placement(search.surface(state.shape).vertices)
         # The scale is the search's. Only the rigid motion between the two shapes remains to be found.
-        scale = state.placement.scale
+        scale = self.stretch * state.placement.scale
         placed = Placement.between(scale * shape.vertices, self.unit * there)
         placement = Placement(placed.rotation, placed.translation, scale)
         surface = MeshProximity(placement(shape.vertices), search.surface(state.shape).vertex_faces)
@@ -364,7 +370,7 @@ class _Fit:
             model=Distances.of(to_scan, to_scan if options.points else None),
             explained=explained,
             seen=seen,
-            noise=self.unit * scale * state.sigma,
+            noise=self.unit * state.placement.scale * state.sigma,
             mirrored=mirrored,
             status=status,
             reason=reason,

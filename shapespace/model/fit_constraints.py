@@ -26,7 +26,7 @@ PLAUSIBLE = 0.001
 
 @dataclass(frozen=True, eq=False)
 class FitConstraints:
-    """What a fit knows beside the scan. Lengths are in the model's normalised units."""
+    """What a fit knows beside the scan. Lengths are in the units of the scan in the search."""
 
     partial: bool  # whether the scan shows only a part of the shape
     free: bool  # whether the fit estimates the scan's size
@@ -41,9 +41,11 @@ class FitConstraints:
     upper: FloatArray
 
     @classmethod
-    def of(cls, options: FitOptions, decoder: Decoder) -> FitConstraints:
-        """Check options. Raises InvalidScanError, or InvalidFixedError if there is no such coordinate."""
-        latents, unit = decoder.latents, decoder.manifest.scale
+    def of(cls, options: FitOptions, decoder: Decoder, unit: float) -> FitConstraints:
+        """Check options, with the length of the search's unit. Raises InvalidScanError, or InvalidFixedError if there
+        is no such coordinate.
+        """
+        latents = decoder.latents
         movable = ~latents.fixed(options.fixed).mask
         if not movable.any():
             raise InvalidScanError("fixed names all coordinates. Leave at least one to be found.")

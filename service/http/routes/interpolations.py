@@ -89,7 +89,7 @@ async def create_interpolation(
 
 @router.get(
     "/interpolations/{id}",
-    responses=binary(MEDIA_TYPES, "The animation.") | problems(404, 406, 422, 503, 504, 507),
+    responses=binary(MEDIA_TYPES, "The animation.", coloured=True) | problems(404, 406, 422, 503, 504, 507),
     response_class=Response,
 )
 async def get_interpolation(

@@ -100,6 +100,17 @@ def test_get_and_post_and_frames_share_bytes_and_tags(client: httpx.Client) -> N
     assert again.status_code == 304
 
 
+@pytest.mark.parametrize("format", ["glb", "usdz"])
+def test_a_coloured_animation_has_one_legend(client: httpx.Client, format: str) -> None:
+    created = client.post(f"{MODEL}/interpolations", json={"keyframes": [CODE, OTHER], "frames": 3}).json()
+    query = {"color": "stretch", "format": format}
+    answer = client.get(created["links"]["self"], params=query).raise_for_status()
+    legend = json.loads(answer.headers["Shape-Color"])
+    alone = client.get(created["links"]["frames"].format(k=2), params={"color": "stretch"}).raise_for_status()
+    assert legend["quantity"] == "stretch"
+    assert legend["range"][1] >= json.loads(alone.headers["Shape-Color"])["range"][1]
+
+
 def test_entity_tags_tell_colours_apart(client: httpx.Client) -> None:
     asked = [{}, *({"color": q, **a} for q in QUANTITIES for a in ({}, {"against": text(OTHER)}))]
     answers = [client.get(MESH, params={"latent": text(CODE), **query}) for query in asked]

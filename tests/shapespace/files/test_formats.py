@@ -232,13 +232,22 @@ def test_weights_of_what_goes_both_ways_lie_between_0_and_1() -> None:
 
 
 def test_more_ways_to_move_than_targets_leave_an_error_that_is_told(rng: np.random.Generator) -> None:
-    mesh, count = MESHES["sheet"](), 2 * DENSE_FRAMES
+    mesh, count = MESHES["sheet"](), 3 * DENSE_FRAMES
     frames = mesh.vertices + 0.01 * rng.standard_normal((count, *mesh.vertices.shape))
     animated = animated_glb(frames, mesh.faces)
     glb = GLB(animated.data)
     error = max(np.linalg.norm(glb.key(k) - frames[k], axis=-1).max() for k in range(count))
     assert error == pytest.approx(animated.max_vertex_error, rel=1e-3)
     assert 1e-4 * mesh.diagonal < error < 0.05
+
+
+def test_a_basis_never_has_more_targets_than_frames(rng: np.random.Generator) -> None:
+    # Vectors with both signs take two targets each.
+    mesh, count = MESHES["sheet"](), DENSE_FRAMES + 2
+    frames = mesh.vertices + 0.01 * rng.standard_normal((count, *mesh.vertices.shape))
+    animated = animated_glb(frames, mesh.faces)
+    assert animated.targets == count - 1
+    assert animated.max_vertex_error < 1e-7
 
 
 def test_frames_that_stand_still_make_a_file_too() -> None:

@@ -141,7 +141,7 @@ def test_a_forearm_gets_another_place_by_an_exchange_of_parts(figure: ShapeModel
     wrong[elbow] = figure.upper[elbow]
     preparation, decoder = FitPreparation(figure.decoder), figure.decoder
     scan = scan_of(figure.decode(code) / decoder.manifest.scale, figure.faces, np.random.default_rng(0))
-    judge = ShapeJudge(decoder, scan, FitConstraints.of(FitOptions(), decoder))
+    judge = ShapeJudge(decoder, scan, FitConstraints.of(FitOptions(), decoder, decoder.manifest.scale))
     shape = preparation.shapes_of(wrong[None]).shapes[0]
     with decoder.solver() as reconstruct:
         found = preparation.exchange(reconstruct, judge, FitState(wrong, shape, Placement(np.eye(3), np.zeros(3), 1)))
@@ -191,6 +191,18 @@ def test_a_size_is_found_where_it_is_free(figure: ShapeModel) -> None:
     found = figure.fit_scan(given.points(), scale="free")
     assert found.placement.scale == pytest.approx(40, rel=1e-3)
     assert given.error(found) < 1e-3
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_a_part_in_other_units_is_fitted_alike(figure: ShapeModel, unit: float) -> None:
+    given = Moved.of(figure, 11)
+    points = given.points()
+    half = points[points[:, 1] > np.median(points[:, 1])]
+    one, other = (figure.fit_scan(k * half, partial=True, scale="free", noise=1e-4 * k) for k in (1.0, unit))
+    assert one.placement.scale == pytest.approx(1, rel=0.02)
+    assert other.placement.scale == pytest.approx(unit * one.placement.scale, rel=1e-3)
+    np.testing.assert_allclose(other.code, one.code, atol=0.02)
+    assert (other.status, other.noise) == (one.status, pytest.approx(unit * one.noise, rel=1e-2))
 
 
 def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
