@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from shapespace.model.decoder import MeshChoice
     from shapespace.model.edit import InvalidTargetError
     from shapespace.model.fit_result import FitStatus
+    from shapespace.model.group_comparison import InvalidGroupsError, compare_groups
     from shapespace.model.latent_space import Bounds, Distribution, LatentError
     from shapespace.model.networks import ModelFailedError
     from shapespace.model.options import (
@@ -108,10 +109,11 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 __version__ = "0.2.0"
 __all__ = [
     "Bounds", "BundleError", "Deadline", "Distribution", "EditOptions", "EncodeOptions", "ExponentialDerivative",
-    "FitOptions", "FitStatus", "InvalidMeshError", "InvalidScanError", "InvalidTargetError", "Landmark", "LatentError",
-    "Material", "MeshChoice", "MeshError", "ModelFailedError", "Objective", "PeriodicError", "Prior", "PriorKind",
-    "Quality", "ScaleChoice", "ShapeModel", "ShellSpace", "Status", "Target", "TriangleMesh", "centre_of_mass",
-    "elastic_mean", "exponential", "geodesic", "load", "logarithm", "models", "parallel_transport",
+    "FitOptions", "FitStatus", "InvalidGroupsError", "InvalidMeshError", "InvalidScanError", "InvalidTargetError",
+    "Landmark", "LatentError", "Material", "MeshChoice", "MeshError", "ModelFailedError", "Objective", "PeriodicError",
+    "Prior", "PriorKind", "Quality", "ScaleChoice", "ShapeModel", "ShellSpace", "Status", "Target", "TriangleMesh",
+    "centre_of_mass", "compare_groups", "elastic_mean", "exponential", "geodesic", "load", "logarithm", "models",
+    "parallel_transport",
 ]  # fmt: skip
 
 #: Public names by the module that defines them.
@@ -124,6 +126,7 @@ _NAMES = {
     "model.decoder": "MeshChoice",
     "model.edit": "InvalidTargetError",
     "model.fit_result": "FitStatus",
+    "model.group_comparison": "InvalidGroupsError compare_groups",
     "model.latent_space": "Bounds Distribution LatentError",
     "model.networks": "ModelFailedError",
     "model.options": "EditOptions EncodeOptions FitOptions Landmark Objective Prior PriorKind ScaleChoice Target",

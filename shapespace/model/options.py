@@ -105,8 +105,11 @@ class SearchOptions:
 
     def __post_init__(self) -> None:
         for option in fields(self):
+            value = getattr(self, option.name)
             if isinstance(option.default, Choice):
-                object.__setattr__(self, option.name, type(option.default)(getattr(self, option.name)))
+                object.__setattr__(self, option.name, type(option.default)(value))
+            elif option.type is int and not 0 <= value < 2**63:
+                raise ValueError(f"{option.name} is {value}. Give a whole number from 0 to 2⁶³ − 1.")
 
     @classmethod
     def of(cls, options: Self | None, changes: Mapping[str, object]) -> Self:
@@ -114,12 +117,15 @@ class SearchOptions:
 
         Raises:
             TypeError: other options than of this class, or an unknown name.
-            ValueError: a string that is no value of its enumeration.
+            ValueError: a string that is no value of its enumeration, or a number that is too small or too large.
         """
         if options is None:
             options = cls()
         if not isinstance(options, cls):
             raise TypeError(f"options must be {cls.__name__}, not {options!r}. Pass single options by name.")
+        names = [option.name for option in fields(cls)]
+        for name in changes.keys() - set(names):
+            raise TypeError(f"there is no option {name!r}: choose among {', '.join(names)}")
         return replace(options, **changes)  # type: ignore[arg-type]
 
 

@@ -414,8 +414,8 @@ class ShapeModel:
             temperature: factor of the differences from the mean of the population; only for "population".
 
         Raises:
-            LatentError: the temperature is negative, not finite, so large that the numbers overflow, or for another
-                distribution.
+            LatentError: the count or the seed is negative; the temperature is negative, not finite, so large that the
+                numbers overflow, or for another distribution.
 
         >>> import shapespace
         >>> model = shapespace.load("models/figure")
@@ -423,6 +423,8 @@ class ShapeModel:
         >>> codes.shape, bool((codes >= model.lower.astype("f4")).all() and (codes <= model.upper.astype("f4")).all())
         ((3, 20), True)
         """
+        if count < 0 or seed < 0:
+            raise LatentError(f"count is {count} and seed is {seed}: neither may be negative.")
         if Distribution(distribution) is not Distribution.POPULATION:
             if temperature != 1:
                 raise LatentError('temperature is only for the distribution "population".')

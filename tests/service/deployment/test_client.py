@@ -85,6 +85,7 @@ def test_codes_are_drawn_found_and_changed(shapes: Client, tmp_path: Path) -> No
     for mesh, format in (
         (turned, None),
         (tmp_path / "shape.obj", None),
+        (str(tmp_path / "shape.obj"), None),
         (shapes.mesh("small", codes[0], "ply"), "ply"),
     ):
         found = shapes.encode("small", mesh, format)

@@ -27,7 +27,7 @@ from shapespace.model.correspondence import InvalidMeshError
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.edit import InvalidTargetError
 from shapespace.model.encode_search import SETTINGS, EncodeSearch
-from shapespace.model.latent_space import NotFiniteError, OutOfBoundsError, WrongLengthError
+from shapespace.model.latent_space import LatentError, NotFiniteError, OutOfBoundsError, WrongLengthError
 from shapespace.model.options import PriorKind, Target
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.model.shape_model import ShapeModel, load
@@ -238,6 +238,13 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
         model.edit(CODES[0], {0: [1, 2]})
     with pytest.raises(NotFiniteError):
         model.edit(CODES[0], {0: [np.inf, 0, 0]})
+    with pytest.raises(TypeError, match=r"no option 'partal': choose among .*partial"):
+        model.fit_scan(CODES, partal=True)
+    for changed in ({"samples": -1}, {"seed": -1}, {"seed": 2**63}):
+        with pytest.raises(ValueError, match="Give a whole number from 0"):
+            model.encode(reference().vertices, **changed)
+    with pytest.raises(LatentError, match="count is -1"):
+        model.sample(-1)
 
 
 def test_shapes_that_were_not_found_are_told(model: ShapeModel, monkeypatch: pytest.MonkeyPatch) -> None:
