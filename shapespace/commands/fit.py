@@ -62,6 +62,10 @@ def fit(
     """Write the fitted shape and the results, and say how the fit ended."""
     if out and out == answer:
         raise click.UsageError("--out and --json name one file: name two", click.get_current_context())
+    unwritten = [name for name in ("samples", "points", "used") if parameters.get(name)]
+    if unwritten and not answer:
+        name = unwritten[0]
+        raise click.UsageError(f"--{name}: only --json FILE shows the result, so add it", click.get_current_context())
     require_new([path for path in (out, answer) if path], force=force)
     format = format_of(out) if out else ""
     loaded = load(model)

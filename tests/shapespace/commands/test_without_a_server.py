@@ -234,6 +234,7 @@ def test_a_page_replaces_files_only_if_it_may(shell: Shell, tmp_path: Path) -> N
         ("fit small none.ply --deadline soon", 2, "'--deadline': 'soon' is not a number."),
         ("fit small none.ply --fixed 1", 2, "'--fixed': needs an object."),
         ("fit small none.ply --landmarks [{\"vertex\":1,\"position\":[0,0,0],\"sgima\":1}]", 2, "0.sgima: there is no"),
+        ("fit small none.ply --samples 3", 2, "--samples: only --json FILE shows the result, so add it."),
         ("fit small none.ply --out - --json -", 2, "--out and --json name one file: name two."),
         ("fit small none.ply --landmarks [{\"vertex\":1}]", 2, "0.position: is not there; add it"),
         ("fit small none.ply --out", 2, "requires an argument"),
