@@ -393,10 +393,9 @@ def _file(mesh: Mesh | bytes | Path | str, format: str | None) -> tuple[bytes, s
     """Return the content of a mesh file, and its format if that is known."""
     if isinstance(mesh, Mesh):
         return _npz(vertices=mesh.vertices, faces=mesh.faces), "npz"
-    if isinstance(mesh, bytes):
-        return mesh, format
-    path = Path(mesh)
-    return path.read_bytes(), format or path.suffix.lstrip(".")
+    if isinstance(mesh, str | Path):
+        return Path(mesh).read_bytes(), format or Path(mesh).suffix.lstrip(".")
+    return mesh, format
 
 
 def _numbers(values: ArrayLike) -> Any:

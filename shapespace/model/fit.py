@@ -20,7 +20,7 @@ from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, Search
 from shapespace.model.fit_settings import SETTINGS, Attempt
 from shapespace.model.fit_uncertainty import Doubt, posterior_of
 from shapespace.model.latent_space import Bounds
-from shapespace.model.options import FitOptions, ScaleChoice
+from shapespace.model.options import FitOptions
 from shapespace.model.part_exchange import SHORT, ShapeJudge
 from shapespace.model.placement import MORE, QUICK, THOROUGH, PlacementEffort, StartPlacement, start_placements
 from shapespace.model.posterior import Posterior
@@ -45,10 +45,11 @@ class Fitter:
     and scale together. The robust weights of distances (Geman and McClure) narrow as the fit improves. The first steps
     use rough shapes and the factors' derivatives, the last steps solved shapes.
 
+    For a scan of a part, some steps then look from the model to the scan too.
+
     While the result is poor, the fit makes further attempts (SETTINGS.attempts). A few steps pull unmatched parts of
     both sides together. Factors get the parts of other codes. Or the fit begins again with more rotations and with the
-    training shapes. A scan of a part may hide a limb, so there training shapes are compared with every result. Also for
-    a part, some steps look from the model to the scan as well.
+    training shapes. A scan of a part may hide a limb, so there training shapes are compared with every result.
     """
 
     def __init__(self, decoder: Decoder) -> None:
@@ -94,13 +95,14 @@ class _Fit:
         self.progress, self.done = progress, 0.0
         self.decoder, self.prepared, self.options, self.deadline = prepared.decoder, prepared, options, deadline
         self.searching = deadline and deadline.for_searching()
-        self.points, self.unit, self.stretch = points, self.decoder.manifest.scale, 1.0
+        self.points, self.unit = points, self.decoder.manifest.scale
         self.scan = scan_of(np.asarray(points, np.float64) / self.unit, faces, np.random.default_rng(options.seed))
-        if options.scale is ScaleChoice.FREE:
+        self.constraints = FitConstraints.of(options, self.decoder)
+        if self.constraints.free:
             # In the search a scan in any units has about the size of a shape.
-            self.stretch = self.scan.size / self._usual_size(prepared.starts)
-            self.scan, self.unit = replace(self.scan, points=self.scan.points / self.stretch), self.unit * self.stretch
-        self.constraints = FitConstraints.of(options, self.decoder, self.unit)
+            stretch = self.scan.size / prepared.starts.size
+            self.scan, self.unit = replace(self.scan, points=self.scan.points / stretch), self.unit * stretch
+            self.constraints = self.constraints.in_units(stretch)
 
     def __call__(self) -> Fitted:
         fixed = self.options.fixed
@@ -153,11 +155,8 @@ class _Fit:
             self.done = share
             self.progress(share)
 
-    def _usual_size(self, starts: StartShapes) -> float:
-        return float(np.median(np.sqrt(starts.shapes.var(axis=1).sum(axis=1))))
-
     def _require_units(self) -> None:
-        ratio = self.scan.size / self._usual_size(self.starts)
+        ratio = self.scan.size / self.starts.size
         if not 1 / (SETTINGS.units_of_part if self.options.partial else SETTINGS.units) <= ratio <= SETTINGS.units:
             raise InvalidScanError(
                 f"The scan is about {ratio:.3g} times as large as the shapes of {self.decoder.manifest.name}. "
@@ -242,9 +241,12 @@ class _Fit:
         begun = both.start(state.code, state.placement, state.shape)
         if begun is None:
             return state
-        found = self._solved(middle, both.run(begun, SETTINGS.both_steps, first=True))
+        moved = both.run(begun, SETTINGS.both_steps, first=True)
         rough.count += both.count
-        return min(state, found, key=lambda each: each.cost)
+        here = rough.start(moved.code, moved.placement, moved.shape)  # its cost counts the points alone
+        if here is None:
+            return state
+        return min(state, self._solved(middle, rough.run(here, 0, first=False)), key=lambda each: each.cost)
 
     def _insistently(self, rough: FitSearch, middle: FitSearch, state: FitState) -> FitState:
         """Return the best fit with solved shapes, after further attempts while it is poor."""
@@ -351,7 +353,7 @@ class _Fit:
         shape = decoder.shape(code, inside, MeshChoice.FINE, self.deadline)
         there = state.placement(search.surface(state.shape).vertices)
         # The scale is the search's. Only the rigid motion between the two shapes remains to be found.
-        scale = self.stretch * state.placement.scale
+        scale = self.unit / decoder.manifest.scale * state.placement.scale
         placed = Placement.between(scale * shape.vertices, self.unit * there)
         placement = Placement(placed.rotation, placed.translation, scale)
         surface = MeshProximity(placement(shape.vertices), search.surface(state.shape).vertex_faces)

@@ -1,8 +1,8 @@
-"""Checked options of a fit, in the model's normalised units."""
+"""Checked options of a fit, in the units of its search."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,7 +26,9 @@ PLAUSIBLE = 0.001
 
 @dataclass(frozen=True, eq=False)
 class FitConstraints:
-    """What a fit knows beside the scan. Lengths are in the units of the scan in the search."""
+    """What a fit knows beside the scan. Lengths are in the units of the scan in the search: normalised units of the
+    model, or those in which a scan of free scale is about as large as a shape.
+    """
 
     partial: bool  # whether the scan shows only a part of the shape
     free: bool  # whether the fit estimates the scan's size
@@ -41,11 +43,12 @@ class FitConstraints:
     upper: FloatArray
 
     @classmethod
-    def of(cls, options: FitOptions, decoder: Decoder, unit: float) -> FitConstraints:
-        """Check options, with the length of the search's unit. Raises InvalidScanError, or InvalidFixedError if there
-        is no such coordinate.
+    def of(cls, options: FitOptions, decoder: Decoder) -> FitConstraints:
+        """Check options. Raises InvalidScanError, or InvalidFixedError if there is no such coordinate.
+
+        Lengths of the result are in the model's normalised units.
         """
-        latents = decoder.latents
+        latents, unit = decoder.latents, decoder.manifest.scale
         movable = ~latents.fixed(options.fixed).mask
         if not movable.any():
             raise InvalidScanError("fixed names all coordinates. Leave at least one to be found.")
@@ -69,6 +72,11 @@ class FitConstraints:
             lower=lower,
             upper=upper,
         )
+
+    def in_units(self, unit: float) -> FitConstraints:
+        """Return the same constraints with lengths in another unit."""
+        noise = None if self.noise is None else self.noise / unit
+        return replace(self, noise=noise, places=self.places / unit, sigmas=self.sigmas / unit)
 
     @cached_property
     def whiten(self) -> FloatArray:

@@ -31,6 +31,11 @@ class StartShapes(NamedTuple):
     codes: FloatArray
     shapes: FloatArray
 
+    @property
+    def size(self) -> float:
+        """Root mean square distance of a shape's vertices from their middle, at the median."""
+        return float(np.median(np.sqrt(self.shapes.var(axis=1).sum(axis=1))))
+
 
 class FitPreparation:
     """Shapes and codes with which fits of a model begin. Each is made at the first scan that needs it."""

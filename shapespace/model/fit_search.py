@@ -74,7 +74,7 @@ SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, 0.5, 2.0)
 class FitSearch:
     """Search for the code and the placement of a shape near a start, with the derivatives of ``encode`` and ``edit``.
 
-    The decoder has lent the solver. The scan is in the model's normalised units. Some evenly spread ``vertices`` of the
+    The decoder has lent the solver. The scan is in the units of ``constraints``. Some evenly spread ``vertices`` of the
     mesh of this accuracy look for points of the scan. No step begins after the deadline.
     """
 

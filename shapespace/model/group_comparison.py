@@ -7,14 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import orth
 
 from shapespace.arrays import FloatArray
 from shapespace.counted import counted
-from shapespace.model.latent_space import LatentSpace
 from shapespace.model.shape_model import ShapeModel
 
-#: Residuals below this share of a column's standard deviation are rounding errors: the column tells nothing.
+#: Covariates, and what they leave of a column, count as nothing below this share of their size: rounding errors.
 ROUNDING = 1e-9
+#: Shortest mean direction of angles, from 0 to 1, that counts as their mean.
+TOGETHER = 0.3
 
 
 class InvalidGroupsError(ValueError):
@@ -66,8 +68,8 @@ def compare_groups(
         seed: seed of the random groups.
 
     Raises:
-        InvalidGroupsError: not two groups of at least two; rows missing; numbers that are not finite; too many
-            covariates; or groups that the covariates tell apart exactly.
+        InvalidGroupsError: not two groups of at least two; labels or rows missing; numbers that are not finite; angles
+            without a mean; too many covariates; or groups that the covariates tell apart exactly.
 
     >>> import numpy as np, shapespace
     >>> model = shapespace.load("figure")
@@ -78,19 +80,24 @@ def compare_groups(
     >>> found.p < 0.05, [name for name, p in zip(model.names, found.p_each) if p < 0.05]
     (True, ['left hip, 1'])
     """
+    if draws < 1 or seed < 0:
+        raise InvalidGroupsError(f"draws is {draws} and seed is {seed}. Give at least 1 and at least 0.")
     rows = _table(codes, "codes")
-    n, latents = len(rows), model.latents
-    if rows.shape[1] != latents.dimension:
+    n = len(rows)
+    if rows.shape[1] != model.dimension:
         raise InvalidGroupsError(
-            f"The codes have {counted(rows.shape[1], 'number')}, but {latents.model} takes {latents.dimension}."
+            f"The codes have {counted(rows.shape[1], 'number')}, but {model.latents.model} takes {model.dimension}."
         )
     labels, second = _two_groups(group, n)
     known = np.empty((n, 0)) if covariates is None else _table(covariates, "covariates")
     if len(known) != n:
         raise InvalidGroupsError(f"There are {counted(len(known), 'row')} of covariates for {counted(n, 'code')}.")
-    rows, known = _unrolled(latents, rows), known / np.abs(known).max(axis=0).clip(min=np.finfo(float).tiny)
-    q, r = np.linalg.qr(np.column_stack([np.ones(n), known]))
-    basis = q[:, np.abs(np.diagonal(r)) > ROUNDING * np.sqrt(n)]
+    rows = _unrolled(model, rows)
+    # Columns may be constant, or follow from others, as those of all sites do.
+    centred = known - known.mean(axis=0)
+    lengths = np.linalg.norm(centred, axis=0)
+    varied = lengths > ROUNDING * np.linalg.norm(known, axis=0)
+    basis = np.column_stack([np.full(n, n**-0.5), orth(centred[:, varied] / lengths[varied], rcond=ROUNDING)])
 
     def unexplained(values: FloatArray) -> FloatArray:
         """Return what the covariates leave of columns (n, …)."""
@@ -104,30 +111,35 @@ def compare_groups(
     if information <= ROUNDING * n:
         raise InvalidGroupsError("The covariates tell the groups apart exactly, so nothing else can be tested.")
     left = unexplained(rows)
-    told = np.sqrt((left**2).sum(axis=0)) > ROUNDING * np.sqrt(n) * (1 + np.abs(rows).max(axis=0))
+    told = np.linalg.norm(left, axis=0) > ROUNDING * np.linalg.norm(rows, axis=0)
     if not told.any():
         raise InvalidGroupsError("The codes don't vary, apart from what the covariates explain.")
 
     def squares(columns: FloatArray) -> FloatArray:
         """Return squared t-values of the group for columns without covariates."""
-        explained = (member @ columns) ** 2 / information
-        rest = np.maximum((columns**2).sum(axis=0) - explained, np.finfo(float).tiny)
-        return np.asarray(explained / rest * freedom)
+        explained = np.outer(member, member @ columns / information)
+        rest = ((columns - explained) ** 2).sum(axis=0)
+        # Where the group explains everything, the quotient is finite, so that all such groups differ as much.
+        return np.asarray((explained**2).sum(axis=0) / np.maximum(rest, ROUNDING * spread) * freedom)
 
-    own, random = squares(left[:, told]), np.random.default_rng(seed)
+    left_told = left[:, told]
+    spread, random = (left_told**2).sum(axis=0), np.random.default_rng(seed)
+    own = squares(left_told)
     # Groups that only exchange alike subjects differ as much, apart from rounding.
-    limits, whole = own * (1 - 1e-9), own.sum() * (1 - 1e-9)
+    limits, whole = own * (1 - 1e-6), own.sum() * (1 - 1e-6)
     as_much, as_much_in_all = np.zeros(len(own), int), 0
     for _ in range(draws):
-        drawn = squares(unexplained(random.permutation(left[:, told])))
+        drawn = squares(unexplained(random.permutation(left_told)))
         as_much += drawn >= limits
         as_much_in_all += int(drawn.sum() >= whole)
-    each = np.ones(latents.dimension)
-    each[told] = (1 + as_much) / (draws + 1)
+    from scipy.stats import false_discovery_control  # takes longer to import than a model
+
+    each = np.ones(model.dimension)
+    each[told] = false_discovery_control((1 + as_much) / (draws + 1))
     difference = member @ left / information
     share = second.mean()
     means = rows.mean(axis=0) + np.outer([-share, 1 - share], difference)
-    return GroupComparison((1 + as_much_in_all) / (draws + 1), _corrected(each, told), difference, means, labels)
+    return GroupComparison((1 + as_much_in_all) / (draws + 1), each, difference, means, labels)
 
 
 def _table(values: ArrayLike, what: str) -> FloatArray:
@@ -150,7 +162,11 @@ def _two_groups(group: Sequence[object] | NDArray, n: int) -> tuple[tuple[object
     given = np.asarray(group)
     if given.shape != (n,):
         raise InvalidGroupsError(f"There are {counted(n, 'code')}. Give a label for each, not {given.shape}.")
-    labels, which, counts = np.unique(given, return_inverse=True, return_counts=True)
+    if any(label is None or label != label for label in given.tolist()):  # NaN
+        raise InvalidGroupsError("A label is missing. Leave its row out.")
+    labels, which, counts = np.unique(
+        given.astype(str) if given.dtype == object else given, return_inverse=True, return_counts=True
+    )
     if len(labels) != 2 or counts.min() < 2:
         found = ", ".join(f"{label} ({count})" for label, count in zip(labels[:5], counts, strict=False))
         raise InvalidGroupsError(f"Give two groups of at least two subjects; there are {len(labels)}: {found}.")
@@ -158,18 +174,19 @@ def _two_groups(group: Sequence[object] | NDArray, n: int) -> tuple[tuple[object
     return (first, second), which == 1
 
 
-def _unrolled(latents: LatentSpace, codes: FloatArray) -> FloatArray:
-    """Return codes (n, m) whose angles lie within half a period of their mean."""
-    centre = codes[0]
-    for _ in range(10):
-        centre = centre + latents.shorter(codes - centre).mean(axis=0)
-    return centre + latents.shorter(codes - centre)
+def _unrolled(model: ShapeModel, codes: FloatArray) -> FloatArray:
+    """Return codes (n, m) whose angles lie within half a period of their mean direction.
 
-
-def _corrected(each: FloatArray, told: NDArray[np.bool_]) -> FloatArray:
-    """Correct the p-values (m,) of the columns that were tested for their number."""
-    from scipy.stats import false_discovery_control  # takes longer to import than a model
-
-    found = each.copy()
-    found[told] = false_discovery_control(each[told])
-    return found
+    Raises InvalidGroupsError if angles have none.
+    """
+    centre = codes.mean(axis=0)
+    for k, period in enumerate(model.period):
+        if period is not None:
+            direction = np.exp(2j * np.pi / period * codes[:, k]).mean()
+            if abs(direction) < TOGETHER:
+                raise InvalidGroupsError(
+                    f"The angles of {model.names[k]} point all ways, so they have no mean. Set number {k} of all "
+                    "codes to 0 to leave it out."
+                )
+            centre[k] = np.angle(direction) * period / (2 * np.pi)
+    return np.asarray(centre + model.latents.shorter(codes - centre))

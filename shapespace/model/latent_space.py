@@ -154,7 +154,8 @@ class LatentSpace:
             name = str(unknown[0])
             known = f" {name} is {self.names.index(name)}." if name in self.names else ""
             raise InvalidFixedError(
-                f"fixed names coordinate {name}, but {self.model} has coordinates 0 to {self.dimension - 1}.{known}"
+                f"fixed names coordinate {unknown[0]!r}, but {self.model} has coordinates 0 to {self.dimension - 1}, "
+                f"whole numbers.{known}"
             )
         mask = np.isin(np.arange(self.dimension), list(values))
         code = np.array([values.get(k, 0.0) for k in range(self.dimension)])

@@ -8,6 +8,7 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral
 from typing import Self
 
 from shapespace.model.choice import Choice
@@ -108,7 +109,7 @@ class SearchOptions:
             value = getattr(self, option.name)
             if isinstance(option.default, Choice):
                 object.__setattr__(self, option.name, type(option.default)(value))
-            elif option.type is int and not 0 <= value < 2**63:
+            elif option.type is int and not (isinstance(value, Integral) and 0 <= int(value) < 2**63):
                 raise ValueError(f"{option.name} is {value}. Give a whole number from 0 to 2⁶³ − 1.")
 
     @classmethod
@@ -124,8 +125,8 @@ class SearchOptions:
         if not isinstance(options, cls):
             raise TypeError(f"options must be {cls.__name__}, not {options!r}. Pass single options by name.")
         names = [option.name for option in fields(cls)]
-        for name in changes.keys() - set(names):
-            raise TypeError(f"there is no option {name!r}: choose among {', '.join(names)}")
+        if unknown := [name for name in changes if name not in names]:
+            raise TypeError(f"there is no option {unknown[0]!r}: choose among {', '.join(names)}")
         return replace(options, **changes)  # type: ignore[arg-type]
 
 

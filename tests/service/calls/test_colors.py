@@ -106,9 +106,9 @@ def test_a_coloured_animation_has_one_legend(client: httpx.Client, format: str) 
     query = {"color": "stretch", "format": format}
     answer = client.get(created["links"]["self"], params=query).raise_for_status()
     legend = json.loads(answer.headers["Shape-Color"])
-    alone = client.get(created["links"]["frames"].format(k=2), params={"color": "stretch"}).raise_for_status()
-    assert legend["quantity"] == "stretch"
-    assert legend["range"][1] >= json.loads(alone.headers["Shape-Color"])["range"][1]
+    frames = [client.get(created["links"]["frames"].format(k=k), params={"color": "stretch"}) for k in range(3)]
+    alone = [json.loads(frame.raise_for_status().headers["Shape-Color"]) for frame in frames]
+    assert legend == max(alone, key=lambda each: each["range"][1])
 
 
 def test_entity_tags_tell_colours_apart(client: httpx.Client) -> None:

@@ -129,9 +129,10 @@ def test_what_is_fixed_is_kept_to_the_last_bit(model: ShapeModel) -> None:
 def test_fixed_values_far_outside_the_bounds_and_names_are_refused(figure: ShapeModel) -> None:
     for fixed, says in (
         ({0: 1e15}, r"fixed\[0\] \(.*\) is 1e\+15, far outside"),
+        ({"3": 0.1}, "coordinate '3', but .* whole numbers"),
         ({7: -1e6}, r"fixed\[7\] \(left knee\) is -1e\+06, far outside"),
-        ({"left knee": 0.1}, "coordinate left knee, but .* 0 to 19. left knee is 7"),
-        ({"left kne": 0.1}, "coordinate left kne, but .* 0 to 19.$"),
+        ({"left knee": 0.1}, "coordinate 'left knee', but .* 0 to 19, whole numbers. left knee is 7"),
+        ({"left kne": 0.1}, "coordinate 'left kne', but .* 0 to 19, whole numbers.$"),
     ):
         with pytest.raises(InvalidFixedError, match=says):
             figure.edit(np.zeros(20), {0: figure.vertices[0]}, fixed=fixed)

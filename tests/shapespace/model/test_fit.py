@@ -141,7 +141,7 @@ def test_a_forearm_gets_another_place_by_an_exchange_of_parts(figure: ShapeModel
     wrong[elbow] = figure.upper[elbow]
     preparation, decoder = FitPreparation(figure.decoder), figure.decoder
     scan = scan_of(figure.decode(code) / decoder.manifest.scale, figure.faces, np.random.default_rng(0))
-    judge = ShapeJudge(decoder, scan, FitConstraints.of(FitOptions(), decoder, decoder.manifest.scale))
+    judge = ShapeJudge(decoder, scan, FitConstraints.of(FitOptions(), decoder))
     shape = preparation.shapes_of(wrong[None]).shapes[0]
     with decoder.solver() as reconstruct:
         found = preparation.exchange(reconstruct, judge, FitState(wrong, shape, Placement(np.eye(3), np.zeros(3), 1)))

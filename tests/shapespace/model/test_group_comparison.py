@@ -64,6 +64,26 @@ def test_without_covariates_it_is_the_exact_test_of_means(figure: ShapeModel) ->
     np.testing.assert_allclose(found.p_each, stats.false_discovery_control(expected), atol=0.06)
 
 
+def test_covariates_may_follow_from_others(figure: ShapeModel) -> None:
+    rng = np.random.default_rng(0)
+    age, site = rng.normal(size=40) + PATIENT, np.eye(3)[rng.integers(3, size=40)]
+    codes = codes_of(figure, 2)
+    codes[:, 3] += 0.8 * age + site[:, 0]
+    known = np.column_stack([PATIENT, site, age])
+    expected = np.linalg.lstsq(known, codes, rcond=None)[0][0]
+    for columns in ([age, site], [site, age], [np.ones(40), site[:, 1:], 1e9 + age], [site[:, :2], age, age]):
+        found = compare_groups(figure, codes, PATIENT, np.column_stack(columns), draws=199)
+        np.testing.assert_allclose(found.difference, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("apart", [1e2, 1e4, 1e6])
+def test_groups_that_are_exchanged_differ_as_much(figure: ShapeModel, apart: float) -> None:
+    # Of the 20 ways to draw three of six, two tell the groups apart so well.
+    codes, patient = codes_of(figure, 3)[:6], np.arange(6) < 3
+    codes[patient] += apart
+    assert compare_groups(figure, codes, patient).p == pytest.approx(0.1, abs=0.01)
+
+
 def test_angles_are_compared_the_shorter_way_round() -> None:
     ring = load(ROOT / "models" / "freaky-torus")
     codes = 0.2 * np.random.default_rng(0).standard_normal((40, 4))
@@ -74,6 +94,14 @@ def test_angles_are_compared_the_shorter_way_round() -> None:
     np.testing.assert_allclose(one.difference, other.difference, atol=1e-9)
     shapes = [ring.decode(each.means) for each in (one, other)]
     np.testing.assert_allclose(shapes[1], shapes[0], atol=1e-5)
+
+
+def test_angles_without_a_mean_are_refused() -> None:
+    ring = load(ROOT / "models" / "freaky-torus")
+    codes = 0.2 * np.random.default_rng(0).standard_normal((40, 4))
+    codes[:, 1] = 2 * np.pi * np.arange(40) / 40
+    with pytest.raises(InvalidGroupsError, match="point all ways"):
+        compare_groups(ring, codes, PATIENT)
 
 
 def test_numbers_that_do_not_vary_are_left_out(figure: ShapeModel) -> None:
@@ -94,6 +122,10 @@ def test_numbers_that_do_not_vary_are_left_out(figure: ShapeModel) -> None:
         ({"group": np.arange(40) == 3}, "two groups of at least two"),
         ({"group": np.arange(40) % 3}, "there are 3"),
         ({"group": PATIENT[:39]}, "40 codes"),
+        ({"group": np.where(PATIENT, np.nan, 0)}, "label is missing"),
+        ({"group": [None, "a"] * 20}, "label is missing"),
+        ({"draws": 0}, "draws is 0"),
+        ({"seed": -1}, "seed is -1"),
         ({"codes": np.zeros((40, 3))}, "takes 20"),
         ({"codes": np.full((40, 20), np.nan)}, "Row 0 of the codes"),
         ({"codes": np.ones((40, 20))}, "don't vary"),
