@@ -26,8 +26,10 @@ PLAUSIBLE = 0.001
 
 @dataclass(frozen=True, eq=False)
 class FitConstraints:
-    """What a fit knows beside the scan. Lengths are in the units of the scan in the search: normalised units of the
-    model, or those in which a scan of free scale is about as large as a shape.
+    """What a fit knows beside the scan.
+
+    Lengths are in the units of the scan in the search. In these units, a scan of free scale is about as large as a
+    shape. Others have the model's normalised units.
     """
 
     partial: bool  # whether the scan shows only a part of the shape
