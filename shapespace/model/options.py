@@ -5,6 +5,7 @@ single options by name. The HTTP interface derives its query parameters and JSON
 """
 
 import inspect
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -109,8 +110,11 @@ class SearchOptions:
             value = getattr(self, option.name)
             if isinstance(option.default, Choice):
                 object.__setattr__(self, option.name, type(option.default)(value))
-            elif option.type is int and not (isinstance(value, Integral) and 0 <= int(value) < 2**63):
-                raise ValueError(f"{option.name} is {value}. Give a whole number from 0 to 2⁶³ − 1.")
+            elif option.type is int:
+                most = option.metadata.get("lt", math.inf)
+                if not (isinstance(value, Integral) and 0 <= int(value) < most):
+                    above = "" if most == math.inf else f", below {most:.2g}"
+                    raise ValueError(f"{option.name} is {value}. Give a whole number of at least 0{above}.")
 
     @classmethod
     def of(cls, options: Self | None, changes: Mapping[str, object]) -> Self:

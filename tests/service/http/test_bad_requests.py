@@ -102,6 +102,10 @@ REQUESTS = {
         f"{MODEL}/edit", {"latent": OK, "targets": [{"vertex": 0, "position": OK}], "fixed": {"0": 1, "00": 2}},
         422, "invalid-request", "'00' is not an index",
     ),
+    "samples without end": post(
+        f"{MODEL}/edit", {"latent": OK, "targets": [{"vertex": 0, "position": OK}], "samples": 10**22},
+        422, "too-many-codes", "the limit is 20",
+    ),
     "a placement that says a thing twice": get(
         f'{MESH}?place={{"scale":1,"scale":2}}', 422, "invalid-request", "the member 'scale' twice"
     ),

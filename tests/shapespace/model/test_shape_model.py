@@ -241,7 +241,7 @@ def test_what_is_wrong_is_said(model: ShapeModel) -> None:
     with pytest.raises(TypeError, match=r"no option 'partal': choose among .*partial"):
         model.fit_scan(CODES, partal=True)
     for changed in ({"samples": -1}, {"seed": -1}, {"seed": 2**63}):
-        with pytest.raises(ValueError, match="Give a whole number from 0"):
+        with pytest.raises(ValueError, match="Give a whole number of at least 0"):
             model.encode(reference().vertices, **changed)
     with pytest.raises(LatentError, match="count is -1"):
         model.sample(-1)
