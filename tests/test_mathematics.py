@@ -31,6 +31,7 @@ NO_MATHEMATICS = {
     "shapespace.model.fit_preparation",
     "shapespace.model.fit_result",
     "shapespace.model.fit_settings",
+    "shapespace.model.fit_verdict",
     "shapespace.model.inputs",
     "shapespace.model.latent_space",
     "shapespace.model.memory",

@@ -71,20 +71,7 @@ def animated_glb(
     """
     frames = frames.astype(np.float32, copy=False)
     rest = frames[0].astype(np.float64)
-    weights: FloatArray
-    fit: FloatArray
-    dense = len(frames) <= DENSE_FRAMES
-    if not dense:
-        corners = np.stack([frames.min(axis=(0, 1)), frames.max(axis=(0, 1))]).astype(np.float64)
-        weights = _basis_weights(frames, BASIS_TOLERANCE * float(diagonal(corners)))
-        fit = np.asarray(np.linalg.pinv(weights), np.float64)
-        # Blender, at least up to 5.0, clips weights below 0. So a vector with both signs becomes two targets.
-        both = (weights < 0).any(axis=0)
-        weights = np.hstack([weights.clip(0), -weights[:, both].clip(max=0)])
-        fit = np.concatenate([fit, -fit[both]])
-        dense = len(fit) >= len(frames) - 1
-    if dense:
-        weights = fit = np.eye(len(frames) - 1)
+    weights, fit = _weights_and_fit(frames)
     keys = np.concatenate([np.zeros((1, len(fit))), weights]).astype(np.float32)
     targets = np.empty((len(fit), *rest.shape), np.float32)
     error = 0.0
@@ -97,7 +84,7 @@ def animated_glb(
     document = GltfBuilder(rest, faces, first, surface, name=name)
     normal_targets = _normal_targets(frames, document.normals, fit)
     if len(targets):
-        kind = "frame" if dense else "component"
+        kind = "frame" if len(fit) == len(frames) - 1 else "component"
         names = [f"{kind} {k}" for k in range(1, len(targets) + 1)]
         document.add_targets(targets, normal_targets, names, _colour_targets(colourings, fit) if first else None)
         times = document.add(np.arange(len(frames)) / fps, bounds=True)
@@ -111,6 +98,21 @@ def animated_glb(
         "max_vertex_error": error,
     }
     return AnimatedGLB(document.glb(), len(targets), error)
+
+
+def _weights_and_fit(frames: NDArray[np.floating]) -> tuple[FloatArray, FloatArray]:
+    """Return the weights (n - 1, k) of the later frames, and the matrix (k, n - 1) from displacements to targets."""
+    each = np.eye(len(frames) - 1)
+    if len(frames) <= DENSE_FRAMES:
+        return each, each
+    corners = np.stack([frames.min(axis=(0, 1)), frames.max(axis=(0, 1))]).astype(np.float64)
+    weights = _basis_weights(frames, BASIS_TOLERANCE * float(diagonal(corners)))
+    # Blender, at least up to 5.0, clips weights below 0. So a vector with both signs becomes two targets.
+    both = (weights < 0).any(axis=0)
+    if weights.shape[1] + both.sum() >= len(each):
+        return each, each
+    fit = np.asarray(np.linalg.pinv(weights), np.float64)
+    return np.hstack([weights.clip(0), -weights[:, both].clip(max=0)]), np.concatenate([fit, -fit[both]])
 
 
 def _blocks(frames: NDArray[np.floating]) -> Iterator[slice]:

@@ -104,7 +104,7 @@ def edited(
 
     Raises:
         InvalidTargetError: see ``require_targets``.
-        NotFiniteError: a target or a fixed value is so far away that numbers overflow.
+        NotFiniteError: a target is so far away that numbers overflow, or a fixed value that no surface is there.
     """
     require_targets(decoder, targets, options.mesh)
     scale, size = decoder.manifest.scale, decoder.reference.diagonal
@@ -126,14 +126,9 @@ def edited(
         )
         here = pulled.placed(before.vertices / scale)
         search = EditSearch(decoder, rough, pulled, begin, here, positions, sigmas, options, fixed, searching)
-        try:
-            best = search.best()
-            code, inside = decoder.latents.found(best.x, Bounds.CLAMP, fixed)
-            changes = pulled.derivatives(best.x)[:, : len(targets)]
-        except np.linalg.LinAlgError:  # an alignment of vertices that are not finite
-            raise NotFiniteError(
-                "Fixed values lie so far outside the bounds that the model's numbers overflow. Give nearer ones."
-            ) from None
+        best = search.best()
+        code, inside = decoder.latents.found(best.x, Bounds.CLAMP, fixed)
+        changes = pulled.derivatives(best.x)[:, : len(targets)]
     found = decoder.shape(code, inside, MeshChoice.COARSE, deadline)
     points = pulled.placed(found.vertices / scale)
     placement = search.placement(points, best.bound)

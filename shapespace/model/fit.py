@@ -15,17 +15,17 @@ from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.decoder import Decoder, MeshChoice
 from shapespace.model.fit_constraints import FitConstraints
 from shapespace.model.fit_preparation import FitPreparation, StartShapes
-from shapespace.model.fit_result import Distances, FitState, FitStatus, Fitted
+from shapespace.model.fit_result import Distances, FitState, Fitted
 from shapespace.model.fit_search import MIDDLE, ROUGH, SOLVED, FitSearch, SearchAccuracy
 from shapespace.model.fit_settings import SETTINGS, Attempt
 from shapespace.model.fit_uncertainty import Doubt, posterior_of
+from shapespace.model.fit_verdict import FitVerdict, is_poor
 from shapespace.model.latent_space import Bounds
 from shapespace.model.options import FitOptions
 from shapespace.model.part_exchange import SHORT, ShapeJudge
 from shapespace.model.placement import MORE, QUICK, THOROUGH, PlacementEffort, StartPlacement, start_placements
 from shapespace.model.posterior import Posterior
 from shapespace.model.scan import InvalidScanError, Scan, scan_of
-from shapespace.model.shape import Shape
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
 from shapespace.solve.outcome import Status
@@ -141,9 +141,13 @@ class _Fit:
                 constraints = replace(self.constraints, places=self.constraints.places * flip)
                 twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK)
                 ratio = twin.cost / best.cost
+            apart = None if rival is None else self._apart(rival, final)
+            verdict = FitVerdict(
+                *(explained, seen, final.moved, ratio, apart, doubt), self.constraints.partial, self.constraints.free
+            )
             counts = full.count + middle.count, rough.count
         # The solver is returned first: decoding the result needs a solver too.
-        return self._answer(full, final, posterior, explained, seen, ratio, rival, doubt, counts)
+        return self._answer(full, final, posterior, verdict, counts)
 
     @property
     def _late(self) -> bool:
@@ -175,7 +179,12 @@ class _Fit:
         if len(constraints.landmarks) < 3:
             shown = shapes[:, self.prepared.shown[: effort.shape_points]]
             return start_placements(
-                search.scan, shown, partial=constraints.partial, free=constraints.free, effort=effort
+                search.scan,
+                shown,
+                partial=constraints.partial,
+                free=constraints.free,
+                effort=effort,
+                deadline=self.searching,
             )
         rows, starts = search.landmark_rows(), list[StartPlacement]()
         for k, shape in enumerate(shapes):
@@ -332,20 +341,14 @@ class _Fit:
         return float(np.linalg.norm(away, axis=1).mean() / one.placement.scale / self.decoder.reference.diagonal)
 
     def _is_poor(self, explained: float, seen: float) -> bool:
-        if self.constraints.partial:
-            return 1 - explained > SETTINGS.missed_of_part
-        return 1 - explained > SETTINGS.missed and 1 - seen > SETTINGS.unseen
+        return is_poor(explained, seen, partial=self.constraints.partial)
 
     def _answer(
         self,
         search: FitSearch,
         state: FitState,
         posterior: Posterior,
-        explained: float,
-        seen: float,
-        mirrored: float | None,
-        rival: FitState | None,
-        doubt: Doubt | None,
+        verdict: FitVerdict,
         counts: tuple[int, int],
     ) -> Fitted:
         decoder, options = self.decoder, self.options
@@ -362,7 +365,9 @@ class _Fit:
         parts = np.array_split(self.points, -(-len(self.points) // CHUNK)) if options.points else []
         found = [surface.closest(part).distances for part in parts if not (self.deadline and self.deadline.passed)]
         every = np.concatenate(found) if found and len(found) == len(parts) else None
-        status, reason = self._status(state, explained, seen, mirrored, rival, doubt, shape)
+        status, reason = verdict.status(late=self.ended or shape.diagnostics.status is Status.DEADLINE)
+        if self.scan.sampled:
+            reason += f" {self.scan.replaced}"
         return Fitted(
             code=code,
             covariance=posterior.covariance,
@@ -370,10 +375,10 @@ class _Fit:
             shape=shape,
             scan=Distances.of(to_model, every),
             model=Distances.of(to_scan, to_scan if options.points else None),
-            explained=explained,
-            seen=seen,
+            explained=verdict.explained,
+            seen=verdict.seen,
             noise=self.unit * state.placement.scale * state.sigma,
-            mirrored=mirrored,
+            mirrored=verdict.mirrored,
             status=status,
             reason=reason,
             samples=posterior.sample(decoder.latents, code, options.samples, options.seed),
@@ -382,44 +387,3 @@ class _Fit:
             solved=counts[0] + 1,
             rough=counts[1],
         )
-
-    def _status(
-        self,
-        state: FitState,
-        explained: float,
-        seen: float,
-        mirrored: float | None,
-        rival: FitState | None,
-        doubt: Doubt | None,
-        shape: Shape,
-    ) -> tuple[FitStatus, str]:
-        """Return how the fit ended, and the reason in words."""
-        shares = f"{explained:.0%} of the scan is near the model, and {seen:.0%} of the model is near the scan"
-        if self.ended or shape.diagnostics.status is Status.DEADLINE:
-            status = FitStatus.DEADLINE
-            reason = f"The time ended before the fit converged: {shares} so far. Give fewer points or a coarser scan."
-        elif self._is_poor(explained, seen):
-            status = FitStatus.POOR
-            reason = f"Only {shares}: the scan is not a shape of this model, or the search failed."
-            if mirrored is not None and mirrored < SETTINGS.mirrored:
-                reason += " Its mirror image fits much better: change the sign of one coordinate."
-            else:
-                if not self.constraints.partial:
-                    reason += " If it shows a part only, set the option `partial`."
-                if not self.constraints.free:
-                    reason += " If its size may differ from the model's, set scale=free."
-                reason += " Three landmarks also help."
-        elif rival is not None:
-            status = FitStatus.AMBIGUOUS
-            apart = self._apart(rival, state)
-            reason = f"{shares}, but another fit, {apart:.0%} of the diagonal away on average, is nearly as good."
-        elif doubt is not None:
-            status, reason = FitStatus.AMBIGUOUS, f"{shares}, but {doubt.words}"
-        elif state.moved > SETTINGS.restless:
-            status = FitStatus.STALLED
-            reason = f"{shares}, but the last step still moved the model by {state.moved:.1%} of the diagonal."
-        else:
-            status, reason = FitStatus.CONVERGED, f"{shares}."
-        if self.scan.sampled:
-            reason += f" {self.scan.replaced}"
-        return status, reason

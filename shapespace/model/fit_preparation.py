@@ -18,7 +18,6 @@ from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import Distribution
 from shapespace.model.part_exchange import PartExchange
 from shapespace.model.placement import THOROUGH, evenly
-from shapespace.model.scan import InvalidScanError
 from shapespace.model.searched_shapes import SearchedShapes
 
 #: Maximum number of training shapes that a fit compares with a scan.
@@ -107,11 +106,8 @@ class FitPreparation:
         return drawn[evenly(population.scores(drawn), SETTINGS.start_shapes)]
 
     def shapes_of(self, codes: FloatArray) -> StartShapes:
-        """Return the codes (k, m) whose shapes are finite, with these shapes."""
+        """Return the shapes of codes (k, m)."""
         with self.decoder.solver() as reconstruct:
             rough = SearchedShapes(self.decoder, reconstruct, None, rough=True)
             raw = np.stack([rough(code) for code in codes])
-        finite = np.isfinite(raw).all(axis=(1, 2))
-        if not finite.any():
-            raise InvalidScanError("No shape has the fixed coordinates. Give values nearer to the bounds.")
-        return StartShapes(codes[finite], self.decoder.placed(raw[finite], MeshChoice.COARSE))
+        return StartShapes(codes, self.decoder.placed(raw, MeshChoice.COARSE))

@@ -15,6 +15,7 @@ from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import Placement
 from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.scan import Scan, nearest_points
+from shapespace.solve.deadline import Deadline
 
 #: Share of the distances that count. The farthest points may belong to a limb in another pose, or to something else.
 TRIMMED = 0.8
@@ -122,13 +123,24 @@ class _Placements(NamedTuple):
 
 
 def start_placements(
-    scan: Scan, shapes: FloatArray, *, partial: bool, free: bool, effort: PlacementEffort
+    scan: Scan,
+    shapes: FloatArray,
+    *,
+    partial: bool,
+    free: bool,
+    effort: PlacementEffort,
+    deadline: Deadline | None = None,
 ) -> list[StartPlacement]:
     """Find the best placements of shapes in a scan, each clearly different from the better ones.
 
     The k shapes are evenly spread points (k, n, 3) in the units of the scan. If ``partial``, points of a shape may be
-    far from the scan. If ``free``, the size may change too.
+    far from the scan. If ``free``, the size may change too. After the deadline, the best placements so far are
+    returned.
     """
+
+    def late() -> bool:
+        return deadline is not None and deadline.passed
+
     some = scan.some(effort.points).points
     turns = np.concatenate([_grid(effort.rotations), *(_principal(shape, some) for shape in shapes[:1])])
     centre = np.median(some, axis=0) if not partial else some.mean(axis=0)
@@ -146,17 +158,24 @@ def start_placements(
         tried.extend(_searched(k, shapes[k], some, begun, steps, partial=partial, free=free))
 
     for k in range(min(FIRST, len(shapes))):
+        if k and late():
+            break
         search(k, np.repeat(turns, len(places), axis=0), np.tile(places, (len(turns), 1)), effort.first_steps)
     kept = _different(tried, middles, effort.kept, DIFFERENT, aside)
     again = np.stack([start.placement.rotation for start in kept])
     there = np.stack([start.placement(middles[start.shape]) for start in kept])
     for k in range(FIRST, len(shapes)):
+        if late():
+            break
         search(k, again, there, 0)
     # At least one placement of each rotation, so that a wrong rotation with the right code doesn't take all places.
     chosen = [*kept, *sorted(tried, key=lambda start: start.score)[: 2 * effort.polished]]
     unique = list({id(start): start for start in chosen}.values())[: effort.kept + effort.polished]
     polished: list[StartPlacement] = []
     for k in sorted({start.shape for start in unique}):
+        if late():
+            polished += [start for start in unique if start.shape == k]
+            continue
         begun = _Placements.of([start.placement for start in unique if start.shape == k])
         polished += _searched(k, shapes[k], some, begun, effort.steps, partial=partial, free=free)
     return _different(polished, middles, effort.count, DIFFERENT / 2, aside / 2)

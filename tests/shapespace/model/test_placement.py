@@ -10,6 +10,7 @@ from shapespace.mesh.rigid_motion import Placement
 from shapespace.model.placement import MORE, QUICK, THOROUGH, PlacementEffort, start_placements
 from shapespace.model.scan import Scan, scan_of
 from shapespace.model.shape_model import ShapeModel
+from shapespace.solve.deadline import Deadline
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +62,17 @@ def test_steps_to_the_closest_points_lower_the_score(body: np.ndarray) -> None:
     ]
     assert scores == sorted(scores, reverse=True)
     assert scores[-1] < 0.8 * scores[0]
+
+
+def test_after_the_deadline_only_the_first_shape_is_tried(body: np.ndarray) -> None:
+    true = somewhere(5)
+    shapes = np.stack([body * stretch for stretch in ([1, 1.5, 1], [1, 1, 1])])
+    in_time, late = (
+        start_placements(
+            scanned(body, true), shapes, partial=False, free=False, effort=QUICK, deadline=Deadline(seconds)
+        )
+        for seconds in (1e9, 0)
+    )
+    assert in_time[0].shape == 1
+    assert {start.shape for start in late} == {0}
+    assert [start.score for start in late] == sorted(start.score for start in late)
