@@ -67,12 +67,13 @@ them with one BLAS thread, and writes this page from `runs/growth.json`. {measur
 PEOPLE = """## The number of shapes
 
 These are n shapes of the generator `people`, each body in {poses} poses, with {coarse} coarse vertices and {modes}
-modes. The last column has the exponent p, if the time grows as n^p. Stages below {shown:.0f} s are left out.
+modes. Stages below {shown:.0f} s are left out.
 
 {seconds}
 
-No stage grows faster than n^{fastest:.2f}. If this goes on, {more} shapes take {hours:.1f} hours of one core
-and {gigabytes:.1f} GB. The largest process takes {memory}.
+- **Time**: {most} shapes take {hours:.1f} hours of one core. No stage grows faster than n^{fastest:.2f} from {least} to
+  {most} shapes, or than n^{lately:.2f} from {before} to {most}.
+- **Memory**: the largest process takes {memory}.
 
 A [cluster](../how-to/cluster.md) computes the samples. Other stages run on one machine,
 because they are short or their steps need all shapes. `python -m benchmarks.stages --people` measures this.
@@ -99,8 +100,6 @@ class Size:
 BASE = Size()
 #: Poses of each body where the number of people grows, and the fewest seconds whose growth means anything.
 PEOPLE_POSES, SHOWN = 5, 5.0
-#: Number of shapes for which the page extrapolates the time.
-MORE_PEOPLE = 1500
 SIZES = [
     BASE,
     *(replace(BASE, fine=fine) for fine in (40_000, 160_000)),
@@ -233,34 +232,32 @@ def stage_figures(size: Size, folder: Path) -> dict[str, Any]:
 
 
 def people_section(rows: list[dict[str, Any]]) -> str:
-    """Return the section about the number of shapes."""
-    stages = [stage for stage in rows[0]["seconds"] if rows[-1]["seconds"][stage] > SHOWN]
-    columns = [str(row["size"]["shapes"]) for row in rows]
+    """Return the section about the number of shapes, from the rows of at least two numbers in rising order."""
+    last, size, counts = rows[-1], Size(**rows[0]["size"]), [row["size"]["shapes"] for row in rows]
+    stages = [stage for stage, seconds in last["seconds"].items() if seconds > SHOWN]
     lines = [[f"`{stage}`", *(f"{row['seconds'][stage]:.0f} s" for row in rows)] for stage in stages]
-    first, last = rows[0], rows[-1]
-    for line, stage in zip(lines, stages, strict=True):
-        growth = np.log(last["seconds"][stage] / max(first["seconds"][stage], 0.1))
-        line.append(f"{growth / np.log(last['size']['shapes'] / first['size']['shapes']):.2f}")
-    exponents = {stage: float(line[-1]) for stage, line in zip(stages, lines, strict=True)}
-    more = last["seconds"] | {
-        stage: last["seconds"][stage] * (MORE_PEOPLE / last["size"]["shapes"]) ** power
-        for stage, power in exponents.items()
-    }
-    most = [(row["size"]["shapes"], row["megabytes"]["most"]) for row in rows[-2:]]
-    trend = np.polyfit([count for count, _ in most], [megabytes for _, megabytes in most], 1)
-    memory = ", ".join(f"{row['megabytes']['most']:.0f} MB with {row['size']['shapes']} shapes" for row in rows)
-    size = Size(**first["size"])
+    lines.append(["all", *(f"{sum(row['seconds'].values()):.0f} s" for row in rows)])
+
+    def fastest(k: int) -> float:
+        """Return the largest exponent with which a stage grows from row k to the last row."""
+        growth = [last["seconds"][stage] / max(rows[k]["seconds"][stage], 0.1) for stage in stages]
+        return float(np.log(max(growth)) / np.log(counts[-1] / counts[k]))
+
     return PEOPLE.format(
         poses=PEOPLE_POSES,
         coarse=size.coarse,
         modes=size.modes,
         shown=SHOWN,
-        seconds=table(("", *columns, "exponent"), lines),
-        memory=memory,
-        fastest=max(exponents.values()),
-        more=MORE_PEOPLE,
-        hours=sum(more.values()) / 3600,
-        gigabytes=float(np.polyval(trend, MORE_PEOPLE)) / 1000,
+        seconds=table(("", *(f"{count} shapes" for count in counts)), lines),
+        hours=sum(last["seconds"].values()) / 3600,
+        least=counts[0],
+        before=counts[-2],
+        most=counts[-1],
+        fastest=fastest(0),
+        lately=fastest(-2),
+        memory=", ".join(
+            f"{row['megabytes']['most']:.0f} MB with {count} shapes" for row, count in zip(rows, counts, strict=True)
+        ),
     )
 
 
@@ -273,8 +270,10 @@ def main() -> None:
     given = parser.parse_args()
     known = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {}
     if given.people:
-        sizes = [replace(BASE, fine=0, shapes=count) for count in sorted(given.people)]
-        known["people"] = [stage_figures(size, given.out / f"people-{size.shapes}") for size in sizes]
+        measured = {row["size"]["shapes"]: row for row in known.get("people", [])}
+        for count in given.people:
+            measured[count] = stage_figures(replace(BASE, fine=0, shapes=count), given.out / f"people-{count}")
+        known["people"] = [measured[count] for count in sorted(measured)]
         pages.write_figures(FIGURES, known)
         write_page()
         return

@@ -1,10 +1,14 @@
 """Models shared by the tests of `encode`, `edit` and `fit`."""
 
+from functools import cache
+
 import pytest
 
+from shapespace.model.fit_result import Fitted
 from shapespace.model.shape_model import ShapeModel, load
 from tests.service.bundles import write_bundle
 from tests.service.conftest import ROOT
+from tests.shapespace.model.moved_shapes import Moved, Plain
 
 
 @pytest.fixture(scope="package")
@@ -19,3 +23,15 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> ShapeModel:
 def figure() -> ShapeModel:
     """The bundled figure."""
     return load(ROOT / "models" / "figure")
+
+
+@pytest.fixture(scope="package")
+def plain(figure: ShapeModel) -> Plain:
+    """For a seed, a moved shape of the figure and the fit to its points without options; each is made once."""
+
+    @cache
+    def fitted(seed: int) -> tuple[Moved, Fitted]:
+        given = Moved.of(figure, seed)
+        return given, figure.fit_scan(given.points())
+
+    return fitted

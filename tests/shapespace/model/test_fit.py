@@ -1,22 +1,17 @@
 """Fits: code, placement and size of a scan are found again; a scan of another shape is reported."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.rigid_motion import Placement
-from shapespace.mesh.triangle_mesh import diagonal
 from shapespace.model.decoder import MeshChoice
 from shapespace.model.fit_constraints import FitConstraints
 from shapespace.model.fit_preparation import FitPreparation
-from shapespace.model.fit_result import FitState, FitStatus, Fitted
+from shapespace.model.fit_result import FitState, FitStatus
 from shapespace.model.fit_settings import SETTINGS
 from shapespace.model.latent_space import InvalidFixedError
 from shapespace.model.options import FitOptions, Landmark
@@ -26,68 +21,12 @@ from shapespace.model.scan import InvalidScanError, scan_of
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.solve.deadline import Deadline
 from tests.service.conftest import ROOT
+from tests.shapespace.model.moved_shapes import Moved, Plain
 
 
 @pytest.fixture(scope="module")
 def ring() -> ShapeModel:
     return load(ROOT / "models" / "freaky-torus")
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A shape of a known code after a known similarity transformation."""
-
-    code: FloatArray
-    shape: FloatArray
-    faces: IntArray
-    size: float
-
-    @classmethod
-    def of(cls, model: ShapeModel, seed: int, scale: float = 1.0, code: FloatArray | None = None) -> "Moved":
-        drawn = np.clip(model.population.sample(1, seed)[0], model.lower, model.upper) if code is None else code
-        shape = model.decode(drawn)
-        turn = Rotation.random(random_state=seed).as_matrix()
-        there = scale * (shape @ turn.T + [3.0, -1.0, 2.0])
-        return cls(drawn, there, model.faces, float(diagonal(there)))
-
-    def points(self, count: int = 4000, seed: int = 0) -> FloatArray:
-        """Random points of the whole surface."""
-        rng = np.random.default_rng(seed)
-        a, b, c = (self.shape[self.faces[:, k]] for k in range(3))
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        chosen = rng.choice(len(areas), count, p=areas / areas.sum())
-        shares = rng.dirichlet(np.ones(3), count)
-        return np.einsum("nk,nkx->nx", shares, self.shape[self.faces[chosen]])
-
-    def seen_from(self, axis: int) -> FloatArray:
-        """Points that are not occluded from a camera far away on an axis."""
-        points = self.points(30_000)
-        cells = np.floor(np.delete(points, axis, 1) / (self.size / 120)).astype(np.int64)
-        _, cell = np.unique(cells, axis=0, return_inverse=True)
-        front = np.full(cell.max() + 1, -np.inf)
-        np.maximum.at(front, cell, points[:, axis])
-        return points[points[:, axis] > front[cell] - 0.02 * self.size][::4]
-
-    def error(self, found: Fitted) -> float:
-        """Mean distance of the vertices found from the true ones, as a fraction of the diagonal."""
-        away = found.placement(found.shape.vertices) - self.shape
-        return float(np.linalg.norm(away, axis=1).mean() / self.size)
-
-
-#: From a seed to a moved shape of the figure and the fit to its points.
-Plain = Callable[[int], tuple[Moved, Fitted]]
-
-
-@pytest.fixture(scope="module")
-def plain(figure: ShapeModel) -> Plain:
-    """For a seed, a moved shape of the figure and the fit to its points without options; each is made once."""
-
-    @cache
-    def fitted(seed: int) -> tuple[Moved, Fitted]:
-        given = Moved.of(figure, seed)
-        return given, figure.fit_scan(given.points())
-
-    return fitted
 
 
 @pytest.mark.parametrize("seed", [1, 3])
@@ -193,18 +132,6 @@ def test_a_size_is_found_where_it_is_free(figure: ShapeModel) -> None:
     assert given.error(found) < 1e-3
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e3])
-def test_a_part_in_other_units_is_fitted_alike(figure: ShapeModel, unit: float) -> None:
-    given = Moved.of(figure, 11)
-    points = given.points()
-    half = points[points[:, 1] > np.median(points[:, 1])]
-    one, other = (figure.fit_scan(k * half, partial=True, scale="free", noise=1e-4 * k) for k in (1.0, unit))
-    assert one.placement.scale == pytest.approx(1, rel=0.02)
-    assert other.placement.scale == pytest.approx(unit * one.placement.scale, rel=1e-3)
-    np.testing.assert_allclose(other.code, one.code, atol=0.02)
-    assert (other.status, other.noise) == (one.status, pytest.approx(unit * one.noise, rel=1e-2))
-
-
 def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
     given = Moved.of(figure, 2)
     rng = np.random.default_rng(1)
@@ -219,40 +146,6 @@ def test_noise_and_outliers_are_told_from_the_shape(figure: ShapeModel) -> None:
     told = figure.fit_scan(points, noise=0.005 * given.size)
     assert given.error(told) < 4e-3
     assert told.noise == pytest.approx(0.005 * given.size)
-
-
-def test_what_one_camera_sees_is_enough_and_the_rest_is_less_certain(figure: ShapeModel, plain: Plain) -> None:
-    given, whole = plain(3)
-    found = figure.fit_scan(given.seen_from(2), partial=True)
-    assert found.status is FitStatus.CONVERGED, found.reason
-    assert given.error(found) < 0.005
-    assert found.seen < 0.9 < found.explained
-    assert np.trace(found.covariance) > np.trace(whole.covariance)
-
-
-@pytest.mark.parametrize(("seed", "axis"), [(2, 0), (9, 2), (12, 0)])
-def test_no_limb_sticks_out_of_what_one_camera_sees(figure: ShapeModel, seed: int, axis: int) -> None:
-    # The points alone also suit a limb that is turned wrongly, because they do not say where the surface ends.
-    given = Moved.of(figure, seed)
-    found = figure.fit_scan(given.seen_from(axis), partial=True)
-    assert found.status is FitStatus.CONVERGED, found.reason
-    assert given.error(found) < 5e-4
-
-
-def test_a_fit_is_ambiguous_where_the_scan_says_little(figure: ShapeModel, plain: Plain) -> None:
-    given, _ = plain(3)
-    moved = np.linalg.norm(figure.jacobian(given.code)[:, :, figure.latents.names.index("left knee")], axis=1)
-    leg = moved > 0.5 * moved.max()
-    nearest = cKDTree(given.shape).query(points := given.points())[1]
-    scan = points[~leg[nearest]]
-    found = figure.fit_scan(scan, partial=True)
-    assert found.status is FitStatus.AMBIGUOUS
-    assert "the scan says little about left knee:" in found.reason
-    assert "Scan the other sides too, or give landmarks" in found.reason
-    # Landmarks on the leg tell where it is.
-    told = [Landmark(int(k), given.shape[k].tolist()) for k in np.flatnonzero(leg)[::20]]
-    found = figure.fit_scan(scan, partial=True, landmarks=told)
-    assert found.status is FitStatus.CONVERGED, found.reason
 
 
 def test_a_piece_that_does_not_belong_is_left_out(figure: ShapeModel) -> None:
