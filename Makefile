@@ -69,7 +69,7 @@ lint: $(VENV)/.all $(BIN)/hadolint ## check style, spelling, types, imports betw
 
 # Left out are tests that need matplotlib or Node, and those of the library that take more than ten seconds together.
 QUICK = $(addprefix tests/,shapespace service/use_cases/test_use_cases.py test_contracts.py test_docs.py) \
-	$(foreach name,files/test_colouring model/test_fit model/test_posterior model/test_shape_model mesh/test_coarsening, \
+	$(foreach name,files/test_colouring model/test_fit model/test_fit_parts model/test_posterior model/test_shape_model mesh/test_coarsening, \
 		--ignore tests/shapespace/$(name).py) \
 	--deselect tests/shapespace/files/test_attributes.py::test_the_khronos_validator_finds_nothing_in_a_textured_animation
 
