@@ -283,6 +283,11 @@ def spread(row: dict[str, Any], model: str) -> tuple[float, float, float]:
     return sum(values) / len(values), min(values), max(values)
 
 
+def leader(found: dict[str, Any]) -> str:
+    """Return the model with the largest R²."""
+    return max(found["r2"], key=lambda model: float(found["r2"][model]["total"]))
+
+
 def leading(found: dict[str, Any]) -> str:
     """Return cells of composite, one factor and kernel, with the largest R² in bold."""
     models = ("composite", "monolithic", "kernel")
@@ -370,7 +375,7 @@ def write_page() -> None:
         leading=leading,
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in rows)),
         range=max(most - least for _, least, most in (spread(row, "composite") for row in real.values())),
-        best=lambda row: max(each["total"] for each in row["evaluation"]["fresh"]["r2"].values()),
+        led=[name for name, row in real.items() if leader(row["evaluation"]["fresh"]) == "composite"],
     )
     pages.write("results", page)
 
