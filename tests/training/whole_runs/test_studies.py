@@ -55,6 +55,7 @@ def test_the_page_of_results_says_what_was_measured(tmp_path: Path, monkeypatch:
     assert f"| horse | {shapes}, {sum(sizes)}, {len(sizes)} ({min(sizes)} – {max(sizes)}) |" in page
     one, kernel = (row["evaluation"]["fresh"]["r2"][model]["total"] for model in ("monolithic", "kernel"))
     assert f"| horse | 0.8765 | {one:.4f} | **{kernel:.4f}** |" in page, "the best is bold"
+    assert "On 0 of the 1 collections, our model (composite) follows the exact shapes best. Not on horse." in page
     assert "yet: hand, faces, samba, makehuman, hippocampus." in page
     assert results.spread(row, "composite")[1] <= results.spread(row, "composite")[0]
     assert "## Number of samples" not in page, "nothing of what was not measured"
