@@ -161,15 +161,17 @@ def nearest_code(shape_of: ShapeMap, target: FloatArray, start: FloatArray) -> N
 
 
 def exponential_map(space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int) -> ShapeMap:
-    """Return the map from codes (m,) to exponentials along modes (m, V, 3) at the mean (V, 3)."""
+    """Return the map from codes (m,) to exponentials along modes (m, V, 3) at the mean (V, 3), which can be pickled."""
+    return partial(_exponential, space, mean, modes, steps)
 
-    def shape_of(code: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
-        path = exponential(space, mean, np.tensordot(code, modes, axes=1), steps)
-        if not path.converged:
-            return None
-        return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)
 
-    return shape_of
+def _exponential(
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, code: FloatArray
+) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
+    path = exponential(space, mean, np.tensordot(code, modes, axes=1), steps)
+    if not path.converged:
+        return None
+    return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)
 
 
 def _nearest(

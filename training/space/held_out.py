@@ -109,10 +109,10 @@ def held_out(
     if choice.kind == "exponential":
         steps = choice.light_steps
         space = _Exponentials(settings, reference, kept, unseen, original_index, material, steps, first_step)
-        count = space.count if choice.count is None else choice.count
+        count, workers = space.count if choice.count is None else choice.count, -1
     else:
         space = StraightLines.of(choice.kind, kept, reference)
-        count = choice.count or len(space)
+        count, workers = choice.count or len(space), 1  # shapes of straight lines take less time than processes
     rivals = simple_models(reference, kept, original[known] == known)
     reached, stuck = [], []
     near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
@@ -120,7 +120,8 @@ def held_out(
         some = space.first(min(each, len(kept) - 1))
         found = some.nearest(unseen)
         if remember:
-            found = RememberingMap(some.shape, some.codes_of(kept), kept, some.sizes).nearest(unseen, found)
+            memory = RememberingMap(some.shape, some.codes_of(kept), kept, some.sizes, workers)
+            found = memory.nearest(unseen, found)
         reached.append(found.codes.shape[1])
         stuck.append(np.array([status is not Status.CONVERGED for status in found.status]))
         for kind, nearest in rivals.items():

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
-from shapespace.training.space.codes import Codes, NearestCode, ShapeMap, nearest_code, together
+from shapespace.training.runs.workers import run
+from shapespace.training.space.codes import Codes, NearestCode, ShapeMap, gathered, nearest_code
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,16 @@ class RememberingMap:
     and with principal components that remember too.
     """
 
-    def __init__(self, plain: ShapeMap, codes: FloatArray, shapes: FloatArray, units: FloatArray) -> None:
-        """Remember shapes (n, V, 3), which have the codes (n, m). ``units`` (m,) are the lengths of the modes."""
-        there = {k: found[0] for k, code in enumerate(codes) if (found := plain(code)) is not None}
+    def __init__(
+        self, plain: ShapeMap, codes: FloatArray, shapes: FloatArray, units: FloatArray, workers: int = 1
+    ) -> None:
+        """Remember shapes (n, V, 3), which have the codes (n, m). ``units`` (m,) are the lengths of the modes.
+
+        With other ``workers`` than 1, ``plain`` has to be a map that can be pickled.
+        """
+        self._workers = workers
+        found = dict(run(partial(_vertices, plain), list(codes), workers=workers))
+        there = {k: vertices for k, vertices in sorted(found.items()) if vertices is not None}
         known = list(there)
         missed = np.stack([align(shapes[k], near) - near for k, near in there.items()]).reshape(len(known), -1)
         self._codes = codes[known]
@@ -73,9 +82,11 @@ class RememberingMap:
 
         The search starts twice: from this code, and from the nearest code of a remembered shape.
         """
-        return together([self._nearest(shape, start) for shape, start in zip(shapes, plain.codes, strict=True)])
+        items = list(zip(shapes, plain.codes, strict=True))
+        return gathered(run(self._nearest, items, workers=self._workers), len(items))
 
-    def _nearest(self, shape: FloatArray, start: FloatArray) -> NearestCode:
+    def _nearest(self, item: tuple[FloatArray, FloatArray]) -> NearestCode:
+        shape, start = item
         known = self._codes[((self._codes - start) ** 2 @ self._units**2).argmin()]
         found = [nearest_code(self.shape, shape, each) for each in (start, known)]
 
@@ -83,3 +94,8 @@ class RememberingMap:
             return float(((each.vertices - shape) ** 2).sum())
 
         return min(found, key=distance)
+
+
+def _vertices(plain: ShapeMap, code: FloatArray) -> FloatArray | None:
+    found = plain(code)
+    return None if found is None else found[0]

@@ -10,7 +10,8 @@ from shapespace.shell.exponential import exponential
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space import codes
-from shapespace.training.space.codes import STEPS_ERROR, box_of, enough_steps, nearest_codes
+from shapespace.training.space.codes import STEPS_ERROR, box_of, enough_steps, exponential_map, nearest_codes
+from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import mode_count, pga
 
 STEPS = 4
@@ -102,3 +103,17 @@ def test_the_number_of_steps_grows_with_the_distance_of_the_codes(
     assert few == 8
     assert more > few
     assert STEPS_ERROR == 1e-5, "a tenth of the error of good networks"
+
+
+def test_exponentials_remember_alike_in_one_process_and_in_two(space, modes, rng):
+    codes = rng.uniform(-0.8, 0.8, (4, 2))
+    shapes = np.stack([shot(space, modes, code) for code in codes]) + 0.02 * rng.standard_normal((4, 1, 3))
+    shapes += 0.02 * shapes**2
+    units, unseen = np.ones(2), shapes[:2] + 0.02 * rng.standard_normal(shapes[:2].shape)
+    plain = exponential_map(space, space.reference.vertices, modes, STEPS)
+    start = nearest_codes(space, space.reference.vertices, modes, unseen, codes[:2], STEPS, workers=1)
+    one, two = (RememberingMap(plain, codes, shapes, units, workers).nearest(unseen, start) for workers in (1, 2))
+    np.testing.assert_array_equal(one.codes, two.codes)
+    np.testing.assert_array_equal(one.vertices, two.vertices)
+    away, without = (np.linalg.norm(found.vertices - unseen) for found in (one, start))
+    assert away < without
