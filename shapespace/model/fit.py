@@ -141,9 +141,15 @@ class _Fit:
                 constraints = replace(self.constraints, places=self.constraints.places * flip)
                 twin, _ = self._roughly(self._search(reconstruct, scan, constraints, ROUGH), QUICK)
                 ratio = twin.cost / best.cost
-            apart = None if rival is None else self._apart(rival, final)
             verdict = FitVerdict(
-                *(explained, seen, final.moved, ratio, apart, doubt), self.constraints.partial, self.constraints.free
+                explained=explained,
+                seen=seen,
+                moved=final.moved,
+                mirrored=ratio,
+                apart=None if rival is None else self._apart(rival, final),
+                doubt=doubt,
+                partial=self.constraints.partial,
+                free=self.constraints.free,
             )
             counts = full.count + middle.count, rough.count
         # The solver is returned first: decoding the result needs a solver too.
