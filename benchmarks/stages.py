@@ -225,6 +225,7 @@ def stage_figures(size: Size, folder: Path) -> dict[str, Any]:
     """Measure the stages with a number of people, and return the figures."""
     found = measure(size, folder, partial(people, size.shapes))
     return {
+        "day": f"{datetime.now(UTC):%Y-%m-%d}",
         "size": asdict(size),
         "seconds": {stage: seconds for stage, (seconds, _) in found.items()},
         "megabytes": {"most": max(megabytes for _, megabytes in found.values())},
@@ -237,6 +238,7 @@ def people_section(rows: list[dict[str, Any]]) -> str:
     stages = [stage for stage, seconds in last["seconds"].items() if seconds > SHOWN]
     lines = [[f"`{stage}`", *(f"{row['seconds'][stage]:.0f} s" for row in rows)] for stage in stages]
     lines.append(["all", *(f"{sum(row['seconds'].values()):.0f} s" for row in rows)])
+    lines.append(["measured on", *(row["day"] for row in rows)])
 
     def fastest(k: int) -> float:
         """Return the largest exponent with which a stage grows from row k to the last row."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapespace.arrays import FloatArray
+from shapespace.arrays import FloatArray, IntArray
 from shapespace.shell.geodesic import Logarithm, logarithm
 from shapespace.shell.space import TOLERANCE, ShellPoint, ShellSpace, edge_length, fault_between, keeps_faces
 from shapespace.solve.anderson import Anderson
@@ -20,6 +20,8 @@ from shapespace.solve.truncated_newton import descend
 ITERATIONS = 100
 #: Below this residual the elastic mean keeps its factor and makes full, accelerated steps.
 RENEW_ABOVE = 1e-2
+#: Largest number of shapes that are tried as a first guess. All would take a time that grows with their square.
+CANDIDATES = 100
 #: Smallest step length of the line search above this residual.
 SMALLEST_STEP = 1e-4
 
@@ -59,14 +61,16 @@ def elastic_mean(
         space: Riemannian space of the shapes.
         shapes: n shapes (V, 3), in any position.
         weights: n weights, not negative, equal by default; only their ratios matter.
-        start: (V, 3) first guess, the shape of least total energy by default.
+        start: (V, 3) first guess. By default it is the shape of least total energy, among the 100 shapes that take the
+            least energy to get the mean lengths and angles.
     """
     shapes, w, fault = _checked(space, shapes, weights)
     if fault:
         return fault
     energy = _MeanEnergy(space, shapes, w)
     if start is None:
-        start = shapes[int(np.argmin([energy.value(x) for x in shapes]))]
+        tried = shapes[energy.typical()]
+        start = tried[int(np.argmin([energy.value(x) for x in tried]))]
     found = _quasi_newton(energy, start)
     return found if found.converged else _newton(energy, found)
 
@@ -76,8 +80,14 @@ class _MeanEnergy:
 
     def __init__(self, space: ShellSpace, shapes: FloatArray, weights: FloatArray) -> None:
         self.space, self._weights = space, weights
-        self._rest = space.energy.rest(space.nric(shapes))
+        self._z = space.nric(shapes)
+        self._rest = space.energy.rest(self._z)
         self.length = edge_length(space)
+
+    def typical(self) -> IntArray:
+        """Return the indices of the CANDIDATES shapes that take the least energy to get the mean lengths and angles."""
+        energies = self._rest.value(self._weights @ self._z)
+        return np.sort(np.argsort(energies, kind="stable")[:CANDIDATES])
 
     def value_at(self, point: ShellPoint) -> float:
         return float(self._weights @ self._rest.value(point.z))

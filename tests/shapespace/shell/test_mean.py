@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.shell.mean import centre_of_mass, elastic_mean
+from shapespace.shell.mean import _MeanEnergy, centre_of_mass, elastic_mean
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from tests.shapespace.conftest import MESHES
@@ -33,6 +33,21 @@ def test_faces_that_differ_much_between_shapes_have_a_mean(name, seed, size):
     found = elastic_mean(space, shapes)
     assert found.status is Status.CONVERGED
     assert_forces_balance(space, shapes, np.ones(len(shapes)), found.vertices)
+
+
+def test_the_first_guess_of_many_shapes_is_a_typical_one(space, mesh, pose, monkeypatch):
+    shapes = mesh.vertices + np.array([-1.0, -0.9, 0.4, 0.5, 0.6, 0.9, 1.0])[:, None, None] * (pose - mesh.vertices)
+    rest = space.energy.rest(space.nric(shapes))
+    best = shapes[np.argmin([rest.value(space.point(x).z).sum() for x in shapes])]
+    every, tried = elastic_mean(space, shapes), []
+    value = _MeanEnergy.value
+    monkeypatch.setattr(_MeanEnergy, "value", lambda energy, x: tried.append(x) or value(energy, x))
+    monkeypatch.setattr("shapespace.shell.mean.CANDIDATES", 3)
+    found = elastic_mean(space, shapes)
+    assert any(np.array_equal(x, best) for x in tried[:3])
+    assert not any(np.array_equal(x, shape) for x in tried[:3] for shape in shapes[:2])
+    assert found.status is Status.CONVERGED
+    np.testing.assert_allclose(found.vertices, every.vertices, atol=1e-7)
 
 
 def test_without_a_mean_the_worst_face_is_named(space, mesh, pose):
