@@ -235,7 +235,7 @@ def stage_figures(size: Size, folder: Path) -> dict[str, Any]:
 def people_section(rows: list[dict[str, Any]]) -> str:
     """Return the section about the number of shapes, from the rows of at least two numbers in rising order."""
     last, size, counts = rows[-1], Size(**rows[0]["size"]), [row["size"]["shapes"] for row in rows]
-    stages = [stage for stage, seconds in last["seconds"].items() if seconds > SHOWN]
+    stages = [stage for stage in STAGES if last["seconds"][stage] > SHOWN]
     lines = [[f"`{stage}`", *(f"{row['seconds'][stage]:.0f} s" for row in rows)] for stage in stages]
     lines.append(["all", *(f"{sum(row['seconds'].values()):.0f} s" for row in rows)])
     lines.append(["measured on", *(row["day"] for row in rows)])
