@@ -70,3 +70,10 @@ def test_weights_that_make_no_mean_are_refused(space, mesh, pose, weights):
             mean(space, [mesh.vertices, pose], weights)
         with pytest.raises(ValueError, match="no shapes"):
             mean(space, [])
+
+
+def test_a_shape_that_is_not_finite_is_named(space, mesh, pose):
+    broken = pose.copy()
+    broken[-1, 0] = np.nan
+    for mean in (elastic_mean, centre_of_mass):
+        assert mean(space, [mesh.vertices, pose, broken]).reason == "shape 2 has a coordinate that is not finite"
