@@ -354,7 +354,6 @@ def write_page() -> None:
     for row in rows.values():
         row["evaluation"] = studies.EMPTY | {"limit": None} | row["evaluation"]
         row["studies"] = {study: {} for study in STUDIES} | row["studies"]
-        row.setdefault("steps", 16)
     real = {name: rows[name] for name in COLLECTIONS if name in rows}
     if some := {name: row for name, row in real.items() if row["evaluation"]["fractions"]}:
         plot_samples(some, pages.MEASUREMENTS / "results-samples.png")

@@ -173,11 +173,9 @@ def start_placements(
     unique = list({id(start): start for start in chosen}.values())[: effort.kept + effort.polished]
     polished: list[StartPlacement] = []
     for k in sorted({start.shape for start in unique}):
-        if late():
-            polished += [start for start in unique if start.shape == k]
-            continue
         begun = _Placements.of([start.placement for start in unique if start.shape == k])
-        polished += _searched(k, shapes[k], some, begun, effort.steps, partial=partial, free=free)
+        steps = 0 if late() else effort.steps
+        polished += _searched(k, shapes[k], some, begun, steps, partial=partial, free=free)
     return _different(polished, middles, effort.count, DIFFERENT / 2, aside / 2)
 
 

@@ -80,13 +80,12 @@ class _MeanEnergy:
 
     def __init__(self, space: ShellSpace, shapes: FloatArray, weights: FloatArray) -> None:
         self.space, self._weights = space, weights
-        self._z = space.nric(shapes)
-        self._rest = space.energy.rest(self._z)
+        self._rest = space.energy.rest(space.nric(shapes))
         self.length = edge_length(space)
 
     def typical(self) -> IntArray:
         """Return the indices of the CANDIDATES shapes that take the least energy to get the mean lengths and angles."""
-        energies = self._rest.value(self._weights @ self._z)
+        energies = self._rest.value(self._weights @ self._rest.z)
         return np.sort(np.argsort(energies, kind="stable")[:CANDIDATES])
 
     def value_at(self, point: ShellPoint) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -66,18 +66,15 @@ def nearest_codes(
     any position; ``start`` (n, m) has codes nearby. The result does not depend on the number of workers.
     """
     items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
-    return gathered(run(partial(_nearest, space, mean, modes, steps), items, workers=workers), len(items))
+    return gathered(
+        run(partial(_nearest, exponential_map(space, mean, modes, steps)), items, workers=workers), len(items)
+    )
 
 
 def gathered(results: Iterable[tuple[int, NearestCode]], count: int) -> Codes:
     """Return the codes of ``count`` searches that end in any order."""
     found = dict(progress(results, "finding the codes of your shapes", "shape", count))
-    return together([found[k] for k in range(count)])
-
-
-def together(found: Sequence[NearestCode]) -> Codes:
-    """Return the codes of several searches."""
-    codes, vertices, counts, status = zip(*found, strict=True)
+    codes, vertices, counts, status = zip(*(found[k] for k in range(count)), strict=True)
     return Codes(np.stack(codes), np.stack(vertices), counts, status)
 
 
@@ -174,7 +171,5 @@ def _exponential(
     return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)
 
 
-def _nearest(
-    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, item: tuple[FloatArray, FloatArray]
-) -> NearestCode:
-    return nearest_code(exponential_map(space, mean, modes, steps), *item)
+def _nearest(shape_of: ShapeMap, item: tuple[FloatArray, FloatArray]) -> NearestCode:
+    return nearest_code(shape_of, *item)

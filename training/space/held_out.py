@@ -109,10 +109,11 @@ def held_out(
     if choice.kind == "exponential":
         steps = choice.light_steps
         space = _Exponentials(settings, reference, kept, unseen, original_index, material, steps, first_step)
-        count, workers = space.count if choice.count is None else choice.count, -1
+        count = space.count if choice.count is None else choice.count
     else:
         space = StraightLines.of(choice.kind, kept, reference)
-        count, workers = choice.count or len(space), 1  # shapes of straight lines take less time than processes
+        count = choice.count or len(space)
+    workers = -1 if choice.kind == "exponential" else 1  # shapes of straight lines take less time than processes
     rivals = simple_models(reference, kept, original[known] == known)
     reached, stuck = [], []
     near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
