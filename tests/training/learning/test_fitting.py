@@ -1,5 +1,6 @@
 """The training loop: it learns, and after a kill it continues to the same result."""
 
+import ctypes
 import itertools
 import resource
 from pathlib import Path
@@ -124,18 +125,35 @@ def test_a_fit_has_as_many_epochs_as_fit_into_its_time(
 
 
 def test_freed_memory_is_kept_from_step_to_step() -> None:
-    """The system maps no new pages for an array as large as one that was freed, and gets the memory back at the end."""
+    """The system maps no new pages for large arrays while networks are trained, and gets the memory back at the end."""
+    size, page = 8 * 8_000_000, resource.getpagesize()
 
-    def mapped_anew() -> int:
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        for _ in range(5):
-            np.ones(8_000_000)
-        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    def mapped_with_an_array() -> int:
+        array = np.ones(size // 8)
+        before = _mapped()
+        del array
+        return before - _mapped()
 
-    usual = mapped_anew()
+    def resident() -> int:
+        return page * int(Path("/proc/self/statm").read_text().split()[1])
+
+    assert mapped_with_an_array() >= size
     with memory_kept():
-        np.ones(8_000_000)
-        kept = mapped_anew()
-        assert kept < usual / 4
-    # The number varies, because the system may map two megabytes at once.
-    assert mapped_anew() > 2 * kept + 50
+        assert mapped_with_an_array() < size / 2
+        kept = resident()
+    assert kept - resident() > size / 2
+    assert mapped_with_an_array() >= size
+
+
+class _Memory(ctypes.Structure):
+    """``struct mallinfo2`` of malloc.h; its fifth number is ``hblkhd``."""
+
+    _fields_ = (("before", 4 * ctypes.c_size_t), ("mapped", ctypes.c_size_t), ("after", 5 * ctypes.c_size_t))
+
+
+def _mapped() -> int:
+    """Return the bytes of arrays that the system mapped one by one."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2
+    mallinfo2.restype = _Memory
+    memory: _Memory = mallinfo2()
+    return int(memory.mapped)
