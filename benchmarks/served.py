@@ -221,23 +221,18 @@ def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
 
 
 def finding(shares: dict[str, float]) -> str:
-    """Say for which rows the model is clearly better than the best simple model, from its share of the error."""
+    """Say in how many rows the model is clearly better than the best simple model, from its shares of the error."""
     if not shares:
         return ""
-    better = {name: share for name, share in shares.items() if share <= CLEARLY}
-    rest = {name: share for name, share in shares.items() if name not in better}
 
-    def said(some: dict[str, float]) -> str:
-        return "; ".join(f"{name} ({share:.2f})" for name, share in some.items())
+    def said(some: list[float]) -> str:
+        return f"{min(some):.2f}" if len(some) == 1 else f"{min(some):.2f} to {max(some):.2f}"
 
-    sentences = []
-    if better:
-        sentences.append(f"Our error is clearly below the error of the best simple model for {said(better)}.")
-    if rest:
-        between = f"{min(rest.values()):.2f} to {max(rest.values()):.2f}"
-        others = f"For the others with a figure in the last column, ours is {between} times as large."
-        sentences.append(others if better else f"None: {said(rest)}.")
-    return "\n".join(sentences)
+    better = [share for share in shares.values() if share <= CLEARLY]
+    rest = [share for share in shares.values() if share > CLEARLY]
+    sentence = f"Our error is at most {CLEARLY} of the best simple model's in {len(better)} of {len(shares)} rows"
+    sentence += f" ({said(better)})" if better else ""
+    return sentence + (f", and {said(rest)} in the others." if rest else ".")
 
 
 def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
