@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import align
+from shapespace.training.runs.progress import progress
 from shapespace.training.runs.workers import run
 from shapespace.training.space.codes import Codes, NearestCode, ShapeMap, gathered, nearest_code
 
@@ -46,7 +47,8 @@ class RememberingMap:
         With other ``workers`` than 1, ``plain`` has to be a map that can be pickled.
         """
         self._workers = workers
-        found = dict(run(partial(_vertices, plain), list(codes), workers=workers))
+        results = run(partial(_vertices, plain), list(codes), workers=workers)
+        found = dict(progress(results, "computing the remembered shapes", "shape", len(codes)))
         there = {k: vertices for k, vertices in sorted(found.items()) if vertices is not None}
         known = list(there)
         missed = np.stack([align(shapes[k], near) - near for k, near in there.items()]).reshape(len(known), -1)

@@ -1,7 +1,8 @@
 """Stage `export`: the bundle, and the distance between its shapes and the collection's."""
 
 import hashlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,21 @@ from shapespace.coordinates.nric import nric
 from shapespace.mesh.attributes import MeshAttributes
 from shapespace.mesh.prolongation import Prolongation
 from shapespace.mesh.triangle_mesh import TriangleMesh
+from shapespace.model.shape_model import ShapeModel
 from shapespace.training.collection.large_arrays import room, stacked
 from shapespace.training.collection.mesh_collection import normalised
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import progress, waiting
 from shapespace.training.runs.provenance import MADE_BY, made_by
+from shapespace.training.runs.workers import run as run_on
 from shapespace.training.space.generalisation import PrincipalComponents, summary, vertex_distances
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.stage import Run, Stage, StageWarning, listed, read_meshes
 
 #: Most bytes of fine shapes that are compared with the shapes of their codes.
 LARGEST_FINE = 2**29
+#: Shapes from which several processes find the codes. Each loads the model, which takes time and memory.
+MANY = 200
 
 
 def export_bundle(run: Run) -> None:
@@ -36,7 +41,7 @@ def export_bundle(run: Run) -> None:
     folder = write_bundle_of(run, figures)
     run.directory.log("exported", bundle=f"{folder.parent.name}/{folder.name}")
     if not run.by_design:
-        _encode_collection(run, folder)
+        encode_collection(run)
 
 
 def write_bundle_of(run: Run, figures: dict[str, Any]) -> Path:
@@ -86,7 +91,7 @@ def _surface(run: RunDirectory) -> MeshAttributes | None:
     return from_entry(entry, arrays, {name: arrays[name].tobytes() for name in entry.textures})
 
 
-def _encode_collection(run: Run, bundle: Path) -> None:
+def encode_collection(run: Run) -> None:
     """Write ``encoded.json``: the distance between the collection's shapes and the shapes of their codes.
 
     Codes are found by ``encode`` as it is served, from the fine mesh as users send it. For comparison there are the
@@ -94,7 +99,7 @@ def _encode_collection(run: Run, bundle: Path) -> None:
     ``least-near.npz`` has the shape with the largest distance, on the coarse mesh.
     """
     directory = run.directory
-    model, names = shapespace.load(bundle), directory.shapes.read()["names"]
+    names = directory.shapes.read()["names"]
     reference = directory.reference.read()
     scale, given, mesh = float(reference["scale"]), directory.own_shapes(), directory.reference_mesh()
     fine, index = _fine_shapes(run), np.arange(len(mesh.vertices))
@@ -102,28 +107,47 @@ def _encode_collection(run: Run, bundle: Path) -> None:
         mesh = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
         given, index = fine, reference["fine_index"]
     diagonal = mesh.diagonal
-    other = _of_components(given, mesh.vertices, model.latents.dimension, diagonal)
+    encode = _Encoding(run.bundle, scale)
+    other = _of_components(given, mesh.vertices, encode.model.latents.dimension, diagonal)
     # One shape at a time, as the fine shapes of a large collection fill the memory.
-    away, outside = room(other.shape), []
-    for k, shape in enumerate(progress(given, "finding the codes of your shapes", "shape", len(given))):
-        found = model.encode(scale * shape)
-        away[k] = vertex_distances(found.shape.vertices / scale, shape, diagonal)
-        if not found.inside_bounds:
-            outside.append(str(names[k]))
+    away, inside = room(other.shape), np.zeros(len(given), dtype=bool)
+    results = run_on(encode, list(given), workers=-1 if len(given) >= MANY else 1)
+    for k, (vertices, inside[k]) in progress(results, "finding the codes of your shapes", "shape", len(given)):
+        away[k] = vertex_distances(vertices, given[k], diagonal)
     worst = int(away.mean(axis=1).argmax())
-    least_near = model.encode(scale * given[worst]).shape.vertices / scale
+    least_near, _ = encode(given[worst])
     facts = summary(away) | {
         "mesh": "coarse" if fine is None and "fine_faces" in reference else "fine",
         "components": summary(other),
         "modes": directory.decomposition.read().get("left"),
         "remembered": run.config.export.examples,
         "shapes": len(given),
-        "outside": outside,
+        "outside": [str(names[k]) for k in np.flatnonzero(~inside)],
         "worst": str(names[worst]),
     }
     directory.least_near.write(given=given[worst][index], found=least_near[index])
     directory.encoded.write({MADE_BY: made_by()} | facts)
     directory.log("encoded", **facts)
+
+
+@dataclass(frozen=True)
+class _Encoding:
+    """``encode`` of a bundle, for shapes of the scale of a run. It can be pickled."""
+
+    bundle: Path
+    scale: float
+
+    @cached_property
+    def model(self) -> ShapeModel:
+        return shapespace.load(self.bundle)
+
+    def __call__(self, shape: FloatArray) -> tuple[FloatArray, bool]:
+        """Return the shape (V, 3) of the code of a shape (V, 3), and whether the code is inside the bounds."""
+        found = self.model.encode(self.scale * shape)
+        return found.shape.vertices / self.scale, found.inside_bounds
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"bundle": self.bundle, "scale": self.scale}
 
 
 def _of_components(shapes: FloatArray, reference: FloatArray, count: int, diagonal: float) -> FloatArray:

@@ -20,7 +20,9 @@ from shapespace.files.formats import MESH_FORMATS
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import load
+from shapespace.training.runs.provenance import MADE_BY
 from shapespace.training.runs.sampling import read
+from shapespace.training.stages import export
 from shapespace.training.stages.networks import learner_of
 from shapespace.training.stages.run import STAGES
 from shapespace.training.stages.stage import Run
@@ -150,6 +152,14 @@ def test_derivatives_are_learned_from_at_training_codes_only(run: Path) -> None:
     # A core computes one file at a time, and all cores have work.
     assert len(list((run / "samples" / "derivatives").glob("part-*.npz"))) == 6
     assert min(figures["times"][each] for each in ("exact", "exact, with derivatives")) > 0
+
+
+def test_several_processes_find_the_codes_that_one_finds(copy: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = copy.directory.encoded.read()
+    copy.directory.encoded.path.unlink()
+    monkeypatch.setattr(export, "MANY", 1)
+    export.encode_collection(copy)
+    assert copy.directory.encoded.read() | {MADE_BY: one[MADE_BY]} == one
 
 
 @pytest.fixture(scope="module")
