@@ -34,15 +34,15 @@ roughness**, and horses gain 7 %.
 
 {table}
 
-Arrows go from the weights alone, with coarse vertices from the file of an [unseen
-shape](../reference/glossary.md#unseen-shape), to the whole answer after `encode`.
+Left of an arrow is the fine mesh that the weights compute from the file's own coarse vertices. On the right is the
+model's answer for the code that `encode` found. All shapes are [unseen](../reference/glossary.md#unseen-shape).
 
 - **distance**: mean over all vertices, in percent of the diagonal.
 - **normals**: median angle in degrees between the normal of a face and the same normal in the file.
 - **roughness**: median angle between the normals of neighbouring faces, divided by the same angle in the file.
 
-Measured in the first fold of [served models](served.md) of {version}. `python -m benchmarks.detail` measures and
-writes this page.
+Measured in the first fold of [served models](served.md), with the code after {version}. `python -m
+benchmarks.detail` measures and writes this page.
 """
 
 

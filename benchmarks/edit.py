@@ -43,6 +43,7 @@ move {mean} mm on average, {most} mm in the worst pull.
 - **others move**: in mm, the mean over the vertices of the other limbs and the head, as mean / largest of all pulls.
 - **target is missed by**: a share of the pull, as median / largest.
 - **factors that change**: by more than 1 % of their bounds, as a mean.
+- **shapes computed** by the search, as mean / largest.
 
 There are {count} pulls by {pull} m from random codes. A change of one [factor](../reference/glossary.md#factor) can
 reach each target. `python -m benchmarks.edit` measures and writes this page.
@@ -52,17 +53,17 @@ reach each target. `python -m benchmarks.edit` measures and writes this page.
 `encode` finds codes almost exactly, and `edit` mostly reaches its targets within 1 %. Both take as long as 10 to 31
 full shapes.
 
-| | median error | largest | over 1 % | time, in shapes |
+| | median error | worst | cases over 1 % | time, in full shapes |
 |---|---|---|---|---|
 | figure, `encode` | 0.0003 % | 0.0016 % | 0 of 200 | 21.7 |
 | figure, `edit` | 0.17 % | 0.57 % | 0 of 40 | 31.0 |
 | torus, `encode` | 0.0008 % | 0.0012 % | 1 of 200 | 9.8 |
 | torus, `edit` | 0.08 % | 1.15 % | 2 of 40 | 23.7 |
 
-- **`encode`** gets shapes of random codes, turned, moved and rounded. The error is a share of a coordinate's range;
-  *largest* is the median error of the worst coordinate.
+- **`encode`** gets shapes of random codes, turned, moved and rounded. The error is a share of a coordinate's range.
+  *Worst* is the median error of the least exact coordinate.
 - **`edit`** moves 1 to 10 vertices to their places on the shape of another code. The error is the largest distance from
-  a target, as a share of the [diagonal](../reference/glossary.md#diagonal).
+  a target, as a share of the [diagonal](../reference/glossary.md#diagonal). *Worst* is the largest of all.
 - **Targets out of reach** take 44 shapes of the figure and 32 of the torus at the median. One edit took 380.
 - **All 4601 vertices** at once take a second.
 

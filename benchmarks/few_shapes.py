@@ -43,13 +43,13 @@ PAGE = """# How many shapes do you need?
 Each cell has our mean [vertex error](../reference/glossary.md#vertex-error) for {unseen} unseen shapes, in percent of
 the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of as many [principal
 components](../reference/glossary.md#principal-component), and to the error of the best of [four simple
-models](generalisation.md#stronger-simple-models). {largest}
+models](generalisation.md#stronger-simple-models). Empty cells: there are too few shapes. {largest}
 
 ## What to do with few shapes
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Expect no details of single shapes.** Five shapes have at most four modes.
+- **Expect no details of single shapes.** From five shapes, training takes at most three modes.
 
 ## How it was measured
 
@@ -145,7 +145,7 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
             first, last = (found[name, count]["modes"] for count in (counts[0], counts[-1]))
             doublings = np.log2(counts[-1] / counts[0])
             falls[name] = 100 * (1 - (last / first) ** (1 / doublings))
-    said = f"Twice as many shapes lower the error on unseen shapes by {between(falls, '{:.0f} %')}."
+    said = f"Each doubling of the shapes lowers the error on unseen shapes by {between(falls, '{:.0f} %')} on average."
     ten = {key[0]: row for key, row in found.items() if key[1] == 10}
     if ten:
         ratios = {name: row["modes"] / row["components"] for name, row in ten.items()}

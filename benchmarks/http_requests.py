@@ -58,10 +58,15 @@ def http(models: Path, count: int, duration: float) -> None:
             "\nTimes are medians in milliseconds by the clock, measured in turn. In brackets are multiples of SuperLU"
         )
         print("and of the PCA server, which adds m fields to a mean and writes the same GLB.\n")
-        print("The first frame of an animation takes about as long as a single frame.\n")
+        print("The first frame of an animation arrives sooner than one frame that is requested alone.\n")
         animations = [[name, *interpolation(client, pid, name, model)] for name, model in names.items()]
-        print(table(("60 frames", "first line", "one frame", "frames / s", "frames / CPU s: lines; GLB"), animations))
-        print("\nAnimations are streamed as JSON lines, or come whole as one GLB. Times are milliseconds by the clock.")
+        print(
+            table(
+                ("60 frames", "first frame", "one frame alone", "frames per s", "frames per CPU s: lines, GLB"),
+                animations,
+            )
+        )
+        print("\nAnimations are streamed as JSON lines, or come whole as one GLB. Times of frames are milliseconds.")
 
 
 def compared(client: httpx.Client, plain: httpx.Client, name: str, model: ShapeModel, count: int) -> list[str]:

@@ -21,9 +21,9 @@ def read_figures(file: Path) -> Any:
 
 
 def measured_with(*files: Path) -> str:
-    """Say in a sentence which versions of shapespace made some files of figures."""
+    """Say in a sentence after which versions of shapespace some files of figures were made."""
     versions = {json.loads(file.read_text(encoding="utf-8"))[MADE_BY]["version"] for file in files}
-    return f"Measured with version {' and '.join(sorted(versions))}."
+    return f"Measured with the code after version {' and '.join(sorted(versions))}."
 
 
 def write_figures(file: Path, found: dict[str, Any] | list[Any]) -> None:

@@ -63,8 +63,8 @@ summary. Errors are mean distances of vertices in percent of the [diagonal](../r
 {unseen}
 
 - After the slash stands the 95th percentile.
-- The [ratio](../reference/glossary.md#ratio) is to as many principal components. In brackets stand the smallest and the
-  largest ratio of a [fold](../reference/glossary.md#fold).{incomplete}
+- *Components* are as many principal components. [Ratios](../reference/glossary.md#ratio) below 1 are good.
+- In brackets stand the smallest and the largest ratio of a [fold](../reference/glossary.md#fold).{incomplete}
 - Each run chose its [map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. Each collection has a second
   model with half of its modes.
 
@@ -221,18 +221,16 @@ def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
 
 
 def finding(shares: dict[str, float]) -> str:
-    """Say in how many rows the model is clearly better than the best simple model, from its shares of the error."""
+    """Say how the model compares with the best simple model, from its shares of that model's error."""
     if not shares:
         return ""
 
-    def said(some: list[float]) -> str:
-        return f"{min(some):.2f}" if len(some) == 1 else f"{min(some):.2f} to {max(some):.2f}"
-
-    better = [share for share in shares.values() if share <= CLEARLY]
-    rest = [share for share in shares.values() if share > CLEARLY]
-    sentence = f"Our error is at most {CLEARLY} of the best simple model's in {len(better)} of {len(shares)} rows"
-    sentence += f" ({said(better)})" if better else ""
-    return sentence + (f", and {said(rest)} in the others." if rest else ".")
+    rounded = [round(share, 2) for share in shares.values()]
+    better = sum(share <= CLEARLY for share in rounded)
+    return (
+        f"Our error is {min(rounded):.2f} to {max(rounded):.2f} of the error of the best simple model. In {better} of "
+        f"{len(rounded)} rows it is at most {CLEARLY} of it."
+    )
 
 
 def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
@@ -296,7 +294,7 @@ def write_page() -> None:
             [title, *(average(known, model, ("mean",)) for model in (None, "components", WITHOUT_EXAMPLES)), drawn]
         )
     heads = {
-        "unseen": ("map", "our error", "ratio", "to the best simple model"),
+        "unseen": ("map", "our error (%)", "ratio to components", "ratio to the best simple model"),
         "simple": ("ours without memory", *SIMPLE.values()),
         "known": ("our error", "of components", "ours without memory", "random shapes"),
     }

@@ -58,8 +58,8 @@ time](../reference/glossary.md#cpu-time) on one thread, as medians over {count} 
 END = """
 ## How it was measured
 
-`python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with version {version}. The
-notes say [why the server is fast](../../benchmarks/NOTES.md#why-the-server-is-fast).
+`python -m benchmarks.serving --page` measures and writes this page. Measured on {day} with the code after
+version {version}. The notes say [why the server is fast](../../benchmarks/NOTES.md#why-the-server-is-fast).
 """
 #: Numbers of codes that a graph takes at once.
 BATCHES = (1, 8, 64)
@@ -164,25 +164,26 @@ def stages(folders: list[Path], count: int) -> None:
     sums, slowest = [each["sum"] for each in medians.values()], max(late, key=lambda name: late[name])
     print("\n## A shape as a file\n")
     print(f"A shape takes {ms(min(sums))} to {ms(max(sums))} ms, by model. Reconstruction takes most of the time.")
-    print(f"One code in twenty takes up to {late[slowest]:.1f} times as long as the median ({slowest}).\n")
+    print(f"For {slowest}, one code in twenty takes at least {late.pop(slowest):.1f} times the median.", end="")
+    print(f" For the others it is {max(late.values()):.1f} times.\n" if late else "\n")
     print(table(("", "p50 / p95 / p99", "full / draft", "without MKL ÷ p50"), tails))
     print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. V is the")
     print("number of coarse vertices. Without [MKL](../reference/glossary.md#blas-mkl), LAPACK solves.")
     if len(folders) > 1:
-        print("Models of a fold are those of [served models](served.md).")
+        print("A *fold* is a model without a fifth of the shapes, as for [unseen shapes](served.md).")
     print("\nShapes of quality `auto` are as close to the exact exponential as full shapes.\n")
     print(table(("mean distance, 1e-4 of the diagonal", "auto", "full", "draft"), exact))
-    print("\nIn brackets are multiples of the distance of full shapes. A product by design has a formula instead of an")
-    print("exponential. For other models without modes there is no exact shape.")
+    print("\nBrackets have the ratio to full shapes. For Freaky Torus, the exact shape comes from its formula. Models")
+    print("with a dash are straight lines of rotations and stretches, which have no exact exponential.")
     if batches:
         print("\nThe graph `decoder.onnx` gives the vertices of drafts in batches.\n")
-        print(table(("code → vertices, one graph", *(f"batch of {size}" for size in BATCHES), "draft / full"), batches))
+        print(table(("code → vertices, one graph", *(f"batch of {size}" for size in BATCHES), "full / draft"), batches))
         print("\nTimes are for one shape, without a file. All columns are from one run, in turn.")
     least = [each["sum"] / each["blend shapes"] for each in medians.values()]
     print(f"\nA shape takes {min(least):.0f} to {max(least):.0f} times as long as the same file from blend shapes.")
     if limits:
         print("An [exact shape](../reference/glossary.md#exponential) takes")
-        print(f"{min(limits):.0f} to {max(limits):.0f} times as long as a shape.")
+        print(f"up to {max(limits):.0f} times as long as a shape.")
     # The other tables are for developers.
     print(table(("model", "networks", "reconstruction (steps)", "file", "sum"), own), file=sys.stderr)
     print(table(("", "blend shapes", "exact shape", "auto / full / draft, ÷ SuperLU", "away"), beside), file=sys.stderr)
@@ -227,7 +228,7 @@ def graph(model: ShapeModel, codes: Codes) -> list[str]:
         for quality in (Quality.DRAFT, Quality.FULL):
             times.setdefault(quality, []).append(seconds(partial(model.shape, codes[first], quality=quality)))
     median = {key: ms(statistics.median(values)) for key, values in times.items()}
-    return [*(median[size] for size in BATCHES), f"{median[Quality.DRAFT]} / {median[Quality.FULL]}"]
+    return [*(median[size] for size in BATCHES), f"{median[Quality.FULL]} / {median[Quality.DRAFT]}"]
 
 
 def ceiling(model: ShapeModel, codes: Codes) -> float | None:

@@ -45,9 +45,10 @@ PAGE = """# How training grows
 How much time and memory does training need, and what makes it need more? [Is it for my data?](../is-it-for-me.md) has
 the minutes of whole runs.
 
-- **Time**: `ingest` grows with files of more than 40,000 vertices, and `modes` with the number of shapes. All other
-  [stages](../reference/run-directory.md) grow with the coarse mesh.
-- **Memory**: the largest process stays below 1 GB up to 40,000 vertices in a file. 500,000 vertices need under 3 GB.
+- **Time**: [`ingest`](../reference/run-directory.md) grows with the files, above 40,000 vertices. The other stages grow
+  with the coarse mesh. [Some also grow](#the-number-of-shapes) with the number of shapes.
+- **Memory**: with {base.shapes} shapes, the largest process needs less than 1 GB up to 40,000 vertices in a file,
+  and less than 3 GB for 500,000.
 
 {table}
 

@@ -104,8 +104,9 @@ class ModeSettings(SettingsTable):
     """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The others are
     straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``
     (rotations and stretches of faces) so that they turn far. Straight lines train in minutes, have one factor and dense
-    modes, and need no ``norm``, ``sparsity`` or samples. ``auto`` takes the cheapest map whose error on held-out shapes
-    is at most 2 % above the least, or 5 % above exponentials."""
+    modes, use no ``norm`` or ``sparsity``, and need few samples, for the evaluation. ``auto`` takes the cheapest map
+    whose error on held-out shapes is at most 2 % above every other straight line, and at most 5 % above
+    exponentials."""
     norm: Literal["mixed", "vertices", "shell"] = "mixed"
     """Norm in which modes approximate shapes. ``vertices``: distances, weighted by area. ``shell``: the metric of the
     shell space, with much weight on wrinkles. ``mixed``: ``vertices`` plus a tenth of ``shell``."""

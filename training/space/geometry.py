@@ -83,7 +83,7 @@ def choose_geometry(
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
     number of modes, the smallest that one of them would have, and with few shapes also half as many. The cheapest
-    map is chosen whose error is at most 2 % above the least, or 5 % above the error of exponentials. No map
+    map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above exponentials. No map
     remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
     modes may cost at most 2 % more.
 
