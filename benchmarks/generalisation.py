@@ -6,21 +6,20 @@ folds has its figures in ``runs/folds/``, and is not measured again. The row ``p
 """
 
 import argparse
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks import pages
-from benchmarks.differential_coordinates import DifferentialCoordinates
 from benchmarks.pages import ROOT
 from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, PEOPLE, SYMMETRIC, open_run
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.generalisation import FOLDS, LIGHT_STEPS, folds, summary, vertex_distances
-from shapespace.training.space.held_out import held_out, simple_models
+from shapespace.training.space.generalisation import FOLDS, LIGHT_STEPS, folds, summary
+from shapespace.training.space.held_out import held_out
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
 
@@ -49,7 +48,7 @@ it is {rest} ([with half of the modes](../../benchmarks/NOTES.md#unseen-shapes-w
 
 Each figure is the error as a share of the error of principal components. {collections}
 
-- *Components with memory* correct their errors at the training shapes, as our bundles do.
+- *Modes* and *components with memory* correct their errors at the training shapes, as our bundles do.
 - The last two columns are the maps `nric` (lengths and angles) and `differential` (rotations and stretches of faces),
   which [training can choose](../explanation/choosing.md#map-from-codes-to-shapes).
 
@@ -87,6 +86,8 @@ than {poses} poses can show, so no model comes near to an unseen one.
 """
 #: A ratio below this is a clear gain.
 PAYS = 0.7
+#: A share of the best simple model's error: up to it a model is clearly better.
+CLEARLY = 0.9
 #: Simple models beside principal components, and their names on pages.
 SIMPLE = {
     "remembering_components": "components with memory",
@@ -147,34 +148,6 @@ def read_shapes(run: RunDirectory) -> tuple[TriangleMesh, FloatArray, IntArray, 
     """Read the reference, all shapes (n, V, 3), the index (n,) of each shape's original, and the originals."""
     given = run.shapes.read()
     return run.reference_mesh(), given["vertices"], given["original"], run.own_shapes()
-
-
-def measure_simple(name: str, data: Path, out: Path, counts: list[float]) -> dict[str, Any]:
-    """Return figures of simple models of a collection, by number of coordinates, in the same folds and meshes."""
-    run = ingested(name, data, out).directory
-    reference, shapes, original, own = read_shapes(run)
-    every = []
-    for k, index in enumerate(folds(len(own))):
-        file = run.study(f"simple-fold-{k}")
-        if not file.exists():
-            known = np.flatnonzero(~np.isin(original, index))
-            models = simple_models(reference, shapes[known], original[known] == known)
-            models["differential_coordinates"] = DifferentialCoordinates(shapes[known], reference).nearest
-            unseen = shapes[index]
-            file.write({
-                kind: [
-                    vertex_distances(nearest(unseen, round(count)), unseen, reference.diagonal).tolist()
-                    for count in counts
-                ]
-                for kind, nearest in models.items()
-            })  # fmt: skip
-            print(name, "simple models", k, flush=True)
-        every.append(file.read())
-    return {
-        kind: [summary(np.concatenate(some)) for some in zip(*(fold[kind] for fold in every), strict=True)]
-        for kind in SIMPLE
-        if all(kind in fold for fold in every)
-    }
 
 
 def measure_people(data: Path, out: Path) -> dict[str, Any]:
@@ -244,23 +217,22 @@ def between(ratios: Collection[float]) -> str:
     return f"{min(ratios):.2f} to {max(ratios):.2f}"
 
 
-def strongest(some: dict[str, dict[str, Any]]) -> str:
-    """Say where straight lines of lengths and angles are nearer to unseen shapes than modes."""
-    shares = [
-        (
-            f"{name}, {count} modes",
-            *(found[kind][k]["mean"] / found["components"][k]["mean"] for kind in ("linear_nric", "modes")),
-        )
-        for name, found in some.items()
-        for k, count in enumerate(found["counts"])
-    ]
-    nearer = [f"{title} ({lines:.2f} against {modes:.2f})" for title, lines, modes in shares if lines < modes]
-    if not nearer:
-        return "Nowhere are straight lines of lengths and angles nearer than modes."
+def against_the_best(shares: Sequence[float]) -> str:
+    """Say how errors compare with the best simple model's, from their shares of it in each row of a table."""
+    rounded = [round(share, 2) for share in shares]
+    better = sum(share <= CLEARLY for share in rounded)
     return (
-        f"Straight lines of lengths and angles are nearer than modes here: {'; '.join(nearer)}. A run with\n"
-        '`geometry = "auto"` [can take them](../explanation/choosing.md#map-from-codes-to-shapes).'
+        f"Our error is {min(rounded):.2f} to {max(rounded):.2f} of the error of the best simple model. In {better} of "
+        f"{len(rounded)} rows it is at most {CLEARLY} of it."
     )
+
+
+def shares_of_the_best(found: dict[str, Any]) -> list[float]:
+    """Return the error of a collection's modes as a share of the best simple model's, for each number of modes."""
+    return [
+        found["modes"][k]["mean"] / min(found[kind][k]["mean"] for kind in ("components", *SIMPLE))
+        for k in range(len(found["counts"]))
+    ]
 
 
 def write_page() -> None:
@@ -278,7 +250,7 @@ def write_page() -> None:
         better=" and ".join(", ".join(better).rsplit(", ", 1)),
         gain=between(better.values()),
         rest=between(rest),
-        strong=strongest(simple),
+        strong=against_the_best([share for found in simple.values() for share in shares_of_the_best(found)]),
         collections="" if simple.keys() == plain.keys() else f"We measured this for {', '.join(simple)} only.",
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in done)),
         simple=pages.table(
@@ -307,17 +279,9 @@ def main() -> None:
     given = parser.parse_args()
     for name in given.names:
         file = FIGURES / f"{name}.json"
-        if name == PEOPLE:
-            if not file.exists():
-                pages.write_figures(file, measure_people(given.data, given.out))
-            write_page()
-            continue
         if not file.exists():
-            found = measure(name, given.data, given.out)
+            found = measure_people(given.data, given.out) if name == PEOPLE else measure(name, given.data, given.out)
             pages.write_figures(file, found)
-        found = pages.read_figures(file)
-        if not found.keys() >= set(SIMPLE) and not name.endswith(MIRRORED):
-            pages.write_figures(file, found | measure_simple(name, given.data, given.out, found["counts"]))
         write_page()
 
 

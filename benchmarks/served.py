@@ -16,7 +16,7 @@ import numpy as np
 import tomlkit
 
 from benchmarks import pages
-from benchmarks.generalisation import SIMPLE
+from benchmarks.generalisation import SIMPLE, against_the_best
 from benchmarks.pages import ROOT, table
 from benchmarks.results import COLLECTIONS, MANNEQUIN, open_run
 from shapespace.arrays import FloatArray
@@ -46,8 +46,6 @@ WITHOUT_EXAMPLES = "nothing remembered"
 HALF = "-half"
 #: Models, in the order of the rows.
 NAMES = tuple(each + ending for each in (*COLLECTIONS, MANNEQUIN) for ending in ("", HALF))
-#: A share of the best simple model's error: below it a model is clearly better.
-CLEARLY = 0.9
 #: Stored figures, one file for each row; a stored fold is not measured again.
 FIGURES = ROOT / "runs" / "collections"
 
@@ -220,19 +218,6 @@ def best_simple(folds: list[dict[str, Any]]) -> tuple[str, float] | None:
     return best, over_shapes(folds) / means[best]
 
 
-def finding(shares: dict[str, float]) -> str:
-    """Say how the model compares with the best simple model, from its shares of that model's error."""
-    if not shares:
-        return ""
-
-    rounded = [round(share, 2) for share in shares.values()]
-    better = sum(share <= CLEARLY for share in rounded)
-    return (
-        f"Our error is {min(rounded):.2f} to {max(rounded):.2f} of the error of the best simple model. In {better} of "
-        f"{len(rounded)} rows it is at most {CLEARLY} of it."
-    )
-
-
 def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
     """Say which rows don't have all folds, and which were measured before runs chose their map."""
     few: dict[int, list[str]] = {}
@@ -302,7 +287,7 @@ def write_page() -> None:
         joint=JOINT,
         factors=OF_FACTORS,
         codes=RANDOM,
-        finding=finding(shares),
+        finding=against_the_best(list(shares.values())),
         simplest="The best simple model is "
         + ", ".join(f"{rival} in {count} rows" for rival, count in rivals.most_common())
         + ".",

@@ -103,7 +103,7 @@ def test_the_best_simple_model_is_the_rival_of_a_row() -> None:
     assert rival == "linear_nric"
     assert share == pytest.approx(0.025 / 0.035)
     assert served.best_simple([{"mean": 0.01, "shapes": 1, "components": {"mean": 0.05}}]) is None, "an older row"
-    said = served.finding({"hand": share, "faces": 1.0, "horse": 0.904})
+    said = generalisation.against_the_best([share, 1.0, 0.904])
     assert said.startswith("Our error is 0.71 to 1.00 of the error of the best simple model. In 2 of 3 rows")
 
 
