@@ -1,6 +1,7 @@
 """The search of a fit: robust weights, and joint Gauss–Newton steps of code, motion and size."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,7 +21,7 @@ from shapespace.model.feature_search import FeatureSearch
 from shapespace.model.fit_constraints import PLAUSIBLE, FitConstraints
 from shapespace.model.fit_result import FitState, VertexDerivatives
 from shapespace.model.pairing import Pairing, Pairs
-from shapespace.model.scan import Scan, independent_points
+from shapespace.model.scan import Scan, independent_points, neighbours
 from shapespace.model.searched_shapes import SearchedShapes
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.deadline import Deadline
@@ -61,14 +62,14 @@ class SearchAccuracy:
     points: int  # number of points of the scan that count
     still: float  # a movement of the shape by less than this length ends the search, as a fraction of the diagonal
     floor: float  # smallest standard deviation of points, as a fraction of the diagonal: the error of such shapes
-    independent: float  # share of the points that count as independent observations
+    independent: float | None  # share of the points that count as independent observations; None measures it
     # derivatives are used again until the code has moved this far, in standard deviations of the population
     kept: float
 
 
 ROUGH = SearchAccuracy(MeshChoice.COARSE, True, 500, 2e-4, 5e-3, 0.1, 0.8)
 MIDDLE = SearchAccuracy(MeshChoice.COARSE, False, 1000, 5e-4, 3e-4, 0.5, 0.8)
-SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, 0.5, 2.0)
+SOLVED = SearchAccuracy(MeshChoice.FINE, False, 4000, 2e-4, 3e-4, None, 2.0)
 
 
 class FitSearch:
@@ -123,6 +124,7 @@ class FitSearch:
             if k == 0 and first:
                 width = float(np.quantile(pairs.distances, SETTINGS.farthest))
             sigma = self._sigma(pairs, state)
+            independent = self._accuracy.independent or self._independent(pairs, sigma)
             if k < drawn:
                 pairs = self._pairing.drawn(pairs, self.surface(state.shape), state.placement, self.tolerance(sigma))
             moved = self._step(
@@ -131,6 +133,7 @@ class FitSearch:
                 max(SETTINGS.width * sigma, width),
                 sigma,
                 SETTINGS.sliding if first else SETTINGS.last_sliding,
+                independent,
             )
             width *= SETTINGS.shrinking
             if moved is None:
@@ -160,8 +163,7 @@ class FitSearch:
         """
         pairs = self._pairs(state)
         sigma, n = self._sigma(pairs, state), pairs.of_scan
-        weights = _robust(pairs.distances[:n], SETTINGS.width * sigma) * pairs.agree[:n]
-        share = independent_points(self._pairing.some.points, pairs.heights[:n], weights)
+        weights, share = self._weights(pairs, sigma), self._independent(pairs, sigma)
         A = self._motions(pairs, state)
         normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
         if shown is not None:
@@ -228,6 +230,23 @@ class FitSearch:
         alike = pairs.agree[: pairs.of_scan] > 0.5
         return max(floor, 1.4826 * float(np.median(heights[alike] if alike.any() else pairs.distances)))
 
+    def _weights(self, pairs: Pairs, sigma: float) -> FloatArray:
+        """Return robust weights (n,) of the scan's points."""
+        n = pairs.of_scan
+        return _robust(pairs.distances[:n], SETTINGS.width * sigma) * pairs.agree[:n]
+
+    def _independent(self, pairs: Pairs, sigma: float) -> float:
+        """Return the share of the scan's points that count as independent observations.
+
+        Where the model can't make the shape, it misses neighbouring points alike.
+        """
+        n = pairs.of_scan
+        return independent_points(self._beside, pairs.heights[:n], self._weights(pairs, sigma))
+
+    @cached_property
+    def _beside(self) -> IntArray:
+        return neighbours(self._pairing.some.points)
+
     def _cost(self, state: FitState, pairs: Pairs) -> float:
         squares = pairs.distances**2
         missed = squares / (squares + (SETTINGS.compared * self._diagonal) ** 2)
@@ -288,13 +307,15 @@ class FitSearch:
         own = np.arange(len(vertices))
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
 
-    def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
+    def _step(
+        self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float, independent: float
+    ) -> FitState | None:
         try:
             fields = self.derivatives_at(state)
         except NotPositiveDefiniteError:
             return None
         weights = _robust(pairs.distances, width) * pairs.agree * pairs.mass
-        weights *= self._accuracy.independent * pairs.of_scan / sigma**2
+        weights *= independent * pairs.of_scan / sigma**2
         A = self._motions(pairs, state)
         size = A.shape[2]
         normal, flat = np.einsum("nxp,nx->np", A, pairs.normals), A.reshape(-1, size)

@@ -88,20 +88,26 @@ def nearest_points(tree: cKDTree, places: FloatArray, count: int = 1) -> tuple[F
     return np.asarray(away), np.asarray(index)
 
 
-def independent_points(points: FloatArray, residuals: FloatArray, weights: FloatArray) -> float:
-    """Return the share of residuals (n,) at points (n, 3) that count as independent observations.
+def neighbours(points: FloatArray) -> IntArray:
+    """Return the neighbours (c, k) of some points of a scan (n, 3), the nearest first."""
+    # The order of points is random, so the first ones represent all.
+    _, found = nearest_points(cKDTree(points), points[:CORRELATED], min(len(points) // 4, 200))
+    return found[:, 1:]
+
+
+def independent_points(beside: IntArray, residuals: FloatArray, weights: FloatArray) -> float:
+    """Return the share of residuals (n,) that count as independent observations.
 
     The share is ``1 / (1 + Σ ρ_k)``, with ρ_k the correlation of residuals of k-th neighbours, up to the k where it
-    falls below 5 %.
+    falls below 5 %. ``beside`` (c, k) has the neighbours of the first points.
     """
     used = weights > 0.25
-    points, residuals = points[used], residuals[used]
-    if len(points) < 50:
+    if used.sum() < 50:
         return 1.0
-    residuals = np.clip(residuals, *(np.quantile(residuals, [0.01, 0.99])))
-    # The order of points is random, so the first ones represent all.
-    _, beside = nearest_points(cKDTree(points), points[:CORRELATED], min(len(points) // 4, 200))
-    products = (residuals[:CORRELATED, None] * residuals[beside[:, 1:]]).mean(axis=0) / (residuals**2).mean()
+    residuals = np.where(used, np.clip(residuals, *(np.quantile(residuals[used], [0.01, 0.99]))), 0)
+    first = slice(len(beside))
+    pairs = np.maximum((used[first, None] & used[beside]).sum(axis=0), 1)
+    products = (residuals[first, None] * residuals[beside]).sum(axis=0) / pairs / (residuals[used] ** 2).mean()
     # Moving averages, because single neighbours are noisy.
     smooth = np.convolve(products, np.ones(5) / 5, mode="valid")
     below = np.flatnonzero(smooth < 0.05)

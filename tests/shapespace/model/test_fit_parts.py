@@ -1,5 +1,7 @@
 """Fits to scans of a part: what is there is matched, and what is hidden is said to be uncertain."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -26,6 +28,19 @@ def test_no_limb_sticks_out_of_what_one_camera_sees(figure: ShapeModel, seed: in
     found = figure.fit_scan(given.seen_from(axis), partial=True)
     assert found.status is FitStatus.CONVERGED, found.reason
     assert given.error(found) < 5e-4
+
+
+@pytest.mark.parametrize(("seed", "axis", "off"), [(5, None, 0.65), (8, 2, 0.8)])
+def test_what_the_model_can_not_make_hardly_moves_the_code(
+    figure: ShapeModel, seed: int, axis: int | None, off: float
+) -> None:
+    # All points of a wave are missed alike, so thousands of them say little more than one.
+    given = Moved.of(figure, seed)
+    waves = np.sin(given.shape[:, [1, 0, 2]] * [28, 36, 32] / given.size)
+    wavy = replace(given, shape=given.shape + 0.01 * given.size * waves)
+    found = figure.fit_scan(wavy.points() if axis is None else wavy.seen_from(axis), partial=axis is not None)
+    deviations = np.sqrt(figure.population.covariance.diagonal())
+    assert np.sqrt((((found.code - given.code) / deviations) ** 2).mean()) < off
 
 
 def test_a_fit_is_ambiguous_where_the_scan_says_little(figure: ShapeModel, plain: Plain) -> None:
