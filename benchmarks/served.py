@@ -223,10 +223,13 @@ def incomplete(rows: dict[str, list[dict[str, Any]]]) -> str:
     few: dict[int, list[str]] = {}
     for name, found in rows.items():
         if len(found) < FOLDS:
-            few.setdefault(len(found), []).append(name)
+            title = f"{name.removesuffix(HALF)} with half of its modes" if name.endswith(HALF) else name
+            few.setdefault(len(found), []).append(title)
     said = [  # one fold has no range
-        f" {'Rows without brackets' if count == 1 else ', '.join(names)} have only {count} of {FOLDS} folds."
-        for count, names in few.items()
+        f" Rows without brackets have only 1 of {FOLDS} folds."
+        if count == 1
+        else f" Only {count} of {FOLDS} folds: {', '.join(titles)}."
+        for count, titles in few.items()
     ]
     if not all("map" in fold for found in rows.values() for fold in found):
         said.append("\n- Rows without a last figure are older: exponentials were the only map then.")
