@@ -247,11 +247,11 @@ def write_page() -> None:
     people = FIGURES / f"{PEOPLE}.json"
     page = PAGE.format(
         people=people_section(pages.read_figures(people)) if people.exists() else "",
-        better=" and ".join(", ".join(better).rsplit(", ", 1)),
+        better=pages.listed(list(better)),
         gain=between(better.values()),
         rest=between(rest),
         strong=against_the_best([share for found in simple.values() for share in shares_of_the_best(found)]),
-        collections="" if simple.keys() == plain.keys() else f"We measured this for {', '.join(simple)} only.",
+        collections="" if simple.keys() == plain.keys() else f"We measured this for {pages.listed(list(simple))} only.",
         measured=pages.measured_with(*(FIGURES / f"{name}.json" for name in done)),
         simple=pages.table(
             ("", "modes", *SIMPLE.values()),

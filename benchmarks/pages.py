@@ -26,6 +26,11 @@ def measured_with(*files: Path) -> str:
     return f"Measured with the code after version {' and '.join(sorted(versions))}."
 
 
+def listed(words: list[str]) -> str:
+    """Return a list in words: ``a, b and c``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
+
 def write_figures(file: Path, found: dict[str, Any] | list[Any]) -> None:
     """Write a mapping or a list of rows to a file in ``runs``, with what made it."""
     file.parent.mkdir(exist_ok=True)

@@ -167,11 +167,6 @@ def draw(found: list[CollectionErrors], path: Path = CHART) -> None:
         drawing(found).savefig(path, format="svg", facecolor="white", metadata=nothing)
 
 
-def listed(words: list[str]) -> str:
-    """Return a list in words: ``a, b and c``."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
-
-
 def cost_of_fewer_shapes(runs: Path) -> str:
     """Say how little accuracy a run with fewer computed shapes loses, by the example of the dancer."""
     fewer, every = (pages.read_figures(runs / "results" / f"{name}.json") for name in ("samba-few", "samba"))
@@ -194,7 +189,7 @@ def page(found: list[CollectionErrors], runs: Path = RUNS) -> str:
         better=[each for each in found if each.pays],
         equal=[each for each in found if not each.pays],
         worse=[each for each in found if round(min([1.0, *each.ratios.values()]), 2) < round(each.ratio, 2)],
-        titles=lambda some: listed([each.title for each in some]),
+        titles=lambda some: pages.listed([each.title for each in some]),
         range=lambda some: f"{min(each.ratio for each in some):.2f} to {max(each.ratio for each in some):.2f}",
         cost=cost_of_fewer_shapes(runs),
         measured=pages.measured_with(*(runs / "collections" / f"{name}.json" for name in by_name)),

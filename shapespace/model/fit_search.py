@@ -124,7 +124,6 @@ class FitSearch:
             if k == 0 and first:
                 width = float(np.quantile(pairs.distances, SETTINGS.farthest))
             sigma = self._sigma(pairs, state)
-            independent = self._accuracy.independent or self._independent(pairs, sigma)
             if k < drawn:
                 pairs = self._pairing.drawn(pairs, self.surface(state.shape), state.placement, self.tolerance(sigma))
             moved = self._step(
@@ -133,7 +132,6 @@ class FitSearch:
                 max(SETTINGS.width * sigma, width),
                 sigma,
                 SETTINGS.sliding if first else SETTINGS.last_sliding,
-                independent,
             )
             width *= SETTINGS.shrinking
             if moved is None:
@@ -163,7 +161,8 @@ class FitSearch:
         """
         pairs = self._pairs(state)
         sigma, n = self._sigma(pairs, state), pairs.of_scan
-        weights, share = self._weights(pairs, sigma), self._independent(pairs, sigma)
+        weights = self._weights(pairs, sigma)
+        share = self._independent(pairs, weights)
         A = self._motions(pairs, state)
         normal = np.einsum("nxp,nx->np", A[:n], pairs.normals[:n])
         if shown is not None:
@@ -235,13 +234,12 @@ class FitSearch:
         n = pairs.of_scan
         return _robust(pairs.distances[:n], SETTINGS.width * sigma) * pairs.agree[:n]
 
-    def _independent(self, pairs: Pairs, sigma: float) -> float:
-        """Return the share of the scan's points that count as independent observations.
+    def _independent(self, pairs: Pairs, weights: FloatArray) -> float:
+        """Return the share of the scan's points, with weights (n,), that count as independent observations.
 
         Where the model can't make the shape, it misses neighbouring points alike.
         """
-        n = pairs.of_scan
-        return independent_points(self._beside, pairs.heights[:n], self._weights(pairs, sigma))
+        return independent_points(self._beside, pairs.heights[: pairs.of_scan], weights)
 
     @cached_property
     def _beside(self) -> IntArray:
@@ -307,14 +305,13 @@ class FitSearch:
         own = np.arange(len(vertices))
         return sparse.csr_array((np.ones(len(vertices)), (own, vertices)), shape=(len(vertices), count))
 
-    def _step(
-        self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float, independent: float
-    ) -> FitState | None:
+    def _step(self, state: FitState, pairs: Pairs, width: float, sigma: float, sliding: float) -> FitState | None:
         try:
             fields = self.derivatives_at(state)
         except NotPositiveDefiniteError:
             return None
         weights = _robust(pairs.distances, width) * pairs.agree * pairs.mass
+        independent = self._accuracy.independent or self._independent(pairs, self._weights(pairs, sigma))
         weights *= independent * pairs.of_scan / sigma**2
         A = self._motions(pairs, state)
         size = A.shape[2]

@@ -1,8 +1,8 @@
 """Stage `export`: the bundle, and the distance between its shapes and the collection's."""
 
 import hashlib
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def encode_collection(run: Run) -> None:
     ``least-near.npz`` has the shape with the largest distance, on the coarse mesh.
     """
     directory = run.directory
-    names = directory.shapes.read()["names"]
+    model, names = shapespace.load(run.bundle), directory.shapes.read()["names"]
     reference = directory.reference.read()
     scale, given, mesh = float(reference["scale"]), directory.own_shapes(), directory.reference_mesh()
     fine, index = _fine_shapes(run), np.arange(len(mesh.vertices))
@@ -107,8 +107,8 @@ def encode_collection(run: Run) -> None:
         mesh = TriangleMesh.from_arrays(reference["fine_vertices"], reference["fine_faces"])
         given, index = fine, reference["fine_index"]
     diagonal = mesh.diagonal
-    encode = _Encoding(run.bundle, scale)
-    other = _of_components(given, mesh.vertices, encode.model.latents.dimension, diagonal)
+    encode = partial(_encoded, model, scale)
+    other = _of_components(given, mesh.vertices, model.latents.dimension, diagonal)
     # One shape at a time, as the fine shapes of a large collection fill the memory.
     away, inside = room(other.shape), np.zeros(len(given), dtype=bool)
     results = run_on(encode, list(given), workers=-1 if len(given) >= MANY else 1)
@@ -130,24 +130,10 @@ def encode_collection(run: Run) -> None:
     directory.log("encoded", **facts)
 
 
-@dataclass(frozen=True)
-class _Encoding:
-    """``encode`` of a bundle, for shapes of the scale of a run. It can be pickled."""
-
-    bundle: Path
-    scale: float
-
-    @cached_property
-    def model(self) -> ShapeModel:
-        return shapespace.load(self.bundle)
-
-    def __call__(self, shape: FloatArray) -> tuple[FloatArray, bool]:
-        """Return the shape (V, 3) of the code of a shape (V, 3), and whether the code is inside the bounds."""
-        found = self.model.encode(self.scale * shape)
-        return found.shape.vertices / self.scale, found.inside_bounds
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"bundle": self.bundle, "scale": self.scale}
+def _encoded(model: ShapeModel, scale: float, shape: FloatArray) -> tuple[FloatArray, bool]:
+    """Return the shape (V, 3) of the code of a shape (V, 3) of a run, and whether the code is inside the bounds."""
+    found = model.encode(scale * shape)
+    return found.shape.vertices / scale, found.inside_bounds
 
 
 def _of_components(shapes: FloatArray, reference: FloatArray, count: int, diagonal: float) -> FloatArray:
