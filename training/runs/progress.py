@@ -25,6 +25,18 @@ SHARES = {
     "evaluation": 5,
     "export": 1,
 }
+#: The same for straight lines, which need no samples.
+STRAIGHT_SHARES = {
+    "ingest": 5,
+    "mean": 33,
+    "modes": 1,
+    "factors": 0,
+    "samples": 0,
+    "networks": 0,
+    "generalisation": 32,
+    "evaluation": 3,
+    "export": 26,
+}
 
 Item = TypeVar("Item")
 
@@ -69,20 +81,21 @@ def waiting(title: str) -> Iterator[None]:
         clock.join()
 
 
-def stage_place(name: str, seconds: Mapping[str, float], stages: Iterable[str]) -> str:
+def stage_place(name: str, seconds: Mapping[str, float], stages: Iterable[str], *, straight: bool = False) -> str:
     """Say which of the ``stages`` this one is, and about how long it and the later stages will take.
 
-    The estimate comes from the ``seconds`` of the stages that are done and from `SHARES`. It is left out before any
-    stage has taken a second.
+    The estimate comes from the ``seconds`` of the stages that are done and from `SHARES`, or `STRAIGHT_SHARES`. It is
+    left out before any stage but the first has taken a second: the time to read files says little about the others.
     """
+    shares = STRAIGHT_SHARES if straight else SHARES
     names = list(stages)
     k = names.index(name)
     words = f"stage {k + 1} of {len(names)}"
-    done = sum(SHARES[each] for each in names[:k] if each in seconds)
-    taken = sum(seconds[each] for each in names[:k] if each in seconds)
+    done = sum(shares[each] for each in names[1:k] if each in seconds)
+    taken = sum(seconds[each] for each in names[1:k] if each in seconds)
     if not done or taken < 1:
         return words
-    left = taken / done * sum(SHARES[each] for each in names[k:]) / 60
+    left = taken / done * sum(shares[each] for each in names[k:]) / 60
     if left < 1:
         return f"{words}, less than a minute left"
     return f"{words}, about {left:.0f} min left" if left < 90 else f"{words}, about {left / 60:.0f} h left"

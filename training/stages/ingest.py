@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -139,6 +139,13 @@ def _coarse_mesh(
     return TriangleMesh.from_arrays(fine.vertices[index], coarsening.faces), index, facts
 
 
+class _Way(NamedTuple):
+    """A way to learn a prolongation: whether weights are fitted, and the ridge of the detail, None without detail."""
+
+    weights: bool
+    ridge: float | None
+
+
 def _prolong(
     run: RunDirectory,
     meshes: MeshCollection,
@@ -151,32 +158,38 @@ def _prolong(
     """Write ``prolongation.npz``; return its errors between fine shapes (n, Vf, 3) and prolonged ones (n, V, 3).
 
     The weights are fitted to all shapes if weights fitted without the shapes ``held`` come closer to these. Detail that
-    depends on the whole shape is added in the same way. The errors are measured on the shapes ``held``. The reference
-    is not among them, because the prolongation is exact there.
+    depends on the whole shape is added in the same way, to fitted weights or to the others: where shapes differ little,
+    it learns more from the others. The errors are measured on the shapes ``held``. The reference is not among them,
+    because the prolongation is exact there.
     """
     own = np.unique(meshes.shell_faces)
     attached = []
     for part in meshes.parts[1:]:
         index = np.setdiff1d(meshes.faces[part.faces], own)
         attached.append(attach_part(reference, fine.vertices[index], index, coarse, some_vertices(exact, index)))
-    prolong = trial = Prolongation.of(reference, fine, attached)
-    every = np.arange(len(exact))
-    fitted = prolong.fitted(coarse, exact, own, np.setdiff1d(every, held))
-    learned, plain = (each.errors(coarse[held], (exact[k] for k in held)) for each in (fitted, prolong))
-    if learned["mean"] < plain["mean"]:
-        prolong, trial = prolong.fitted(coarse, exact, own, every), fitted
-    facts: dict[str, Any] = min(learned, plain, key=lambda errors: errors["mean"])
-    if exact.shape[0] * exact.shape[1] <= MOST_DETAILED:
-        known = np.setdiff1d(every, held)
-        tries = {ridge: trial.detailed(reference.vertices, coarse, exact, own, known, ridge) for ridge in RIDGES}
-        errors = {ridge: each.errors(coarse[held], (exact[k] for k in held)) for ridge, each in tries.items()}
-        ridge = min(errors, key=lambda each: errors[each]["mean"])
-        if errors[ridge]["mean"] <= (1 - GAIN) * facts["mean"]:
-            prolong = prolong.detailed(reference.vertices, coarse, exact, own, every, ridge)
-            trial, facts = tries[ridge], errors[ridge]
-    run.prolongation.write(**prolong.arrays())
+    bound, every = Prolongation.of(reference, fine, attached), np.arange(len(exact))
+    known = np.setdiff1d(every, held)
+
+    def detailed(prolong: Prolongation, ridge: float | None, shapes: IntArray) -> Prolongation:
+        if ridge is None:
+            return prolong
+        return prolong.detailed(reference.vertices, coarse, exact, own, shapes, ridge)
+
+    bases = {True: bound.fitted(coarse, exact, own, known), False: bound}
+    plain = [_Way(weights, None) for weights in bases]
+    small = exact.shape[0] * exact.shape[1] <= MOST_DETAILED
+    others = [_Way(weights, ridge) for weights in bases for ridge in RIDGES] if small else []
+    trials = {way: detailed(bases[way.weights], way.ridge, known) for way in (*plain, *others)}
+    errors = {way: trial.errors(coarse[held], (exact[k] for k in held)) for way, trial in trials.items()}
+    way = min(plain, key=lambda each: errors[each]["mean"])
+    best = min(errors, key=lambda each: errors[each]["mean"])
+    if errors[best]["mean"] <= (1 - GAIN) * errors[way]["mean"]:
+        way = best
+    facts: dict[str, Any] = errors[way]
+    base = bound.fitted(coarse, exact, own, every) if way.weights else bound
+    run.prolongation.write(**detailed(base, way.ridge, every).arrays())
     if attached:
-        distances = trial.distances(coarse[held], (exact[k] for k in held))
+        distances = trials[way].distances(coarse[held], (exact[k] for k in held))
         facts["parts"] = _part_errors(meshes, own, attached, distances)
     return facts
 

@@ -236,7 +236,8 @@ def _do(stage: Stage, run: Run, keys: dict[str, str], stamp: dict[str, Any], sho
     directory.stamp(name).write(begun)
     directory.log("begin", stage=name, key=keys["key"])
     stages = [each for each, other in STAGES.items() if not (run.by_design and other.meshes_only)]
-    place = f" {stage_place(name, _seconds(directory), stages)}" if name in stages else ""
+    straight = directory.straight_kind() is not None
+    place = f" {stage_place(name, _seconds(directory), stages, straight=straight)}" if name in stages else ""
     show(f"{name} …{place}")
     start = time.monotonic()
     if stage.meshes_only and run.by_design:

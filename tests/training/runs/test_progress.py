@@ -43,7 +43,7 @@ def test_what_cannot_say_how_far_it_is_says_how_long(capfd: pytest.CaptureFixtur
 def test_a_stage_has_a_place_and_an_estimate_from_the_stages_before() -> None:
     names = list(progress.SHARES)
     assert progress.stage_place("ingest", {}, names) == "stage 1 of 9"
-    assert progress.stage_place("mean", {"ingest": 0.3}, names) == "stage 2 of 9"
+    assert progress.stage_place("mean", {"ingest": 30}, names) == "stage 2 of 9"
     done = {name: 60.0 * progress.SHARES[name] for name in names[:4]}
     left = 100 - sum(progress.SHARES[name] for name in names[:4])
     assert progress.stage_place("samples", done, names) == f"stage 5 of 9, about {left} min left"
@@ -52,14 +52,20 @@ def test_a_stage_has_a_place_and_an_estimate_from_the_stages_before() -> None:
     assert progress.stage_place("samples", twice, names) == f"stage 5 of 9, about {4 * left / 60:.0f} h left"
     brief = {name: seconds / 100 for name, seconds in done.items()}
     assert progress.stage_place("samples", brief, names) == "stage 5 of 9, less than a minute left"
+    measured = {"ingest": 4.0, "mean": 113.0}  # of straight lines; 201 s were left
+    assert progress.stage_place("modes", measured, names, straight=True) == "stage 3 of 9, about 4 min left"
     # A product by design skips three stages, and a later stage that was done before says nothing about this one.
     few = [name for name in names if name not in ("mean", "modes", "generalisation")]
-    assert progress.stage_place("networks", done | {"export": 1e6}, few) == "stage 4 of 6, about 21 min left"
+    assert (
+        progress.stage_place("networks", done | {"samples": 2520, "export": 1e6}, few)
+        == "stage 4 of 6, about 21 min left"
+    )
 
 
 def test_every_stage_has_a_share_of_the_time() -> None:
-    assert list(progress.SHARES) == list(STAGE_NAMES)
-    assert sum(progress.SHARES.values()) == 100
+    for shares in (progress.SHARES, progress.STRAIGHT_SHARES):
+        assert list(shares) == list(STAGE_NAMES)
+        assert sum(shares.values()) == 100
 
 
 def test_what_is_quick_says_nothing(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

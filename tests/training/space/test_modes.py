@@ -17,6 +17,7 @@ from shapespace.shell.geodesic import geodesic
 from shapespace.shell.space import ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space import logarithms as search
 from shapespace.training.space import sparse_modes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import ModeError, Modes, Norm, localisation, mode_count, pga
@@ -400,6 +401,25 @@ def test_where_there_is_no_geodesic_the_logarithm_is_linearised(mixed, rng):
     assert found.reasons[1] == ""
     z = mixed.space.nric(mixed.mean)
     assert (found.fields[0] == mixed.space.project(mixed.mean, unwrap(mixed.space.nric(crumpled), z) - z)).all()
+
+
+@pytest.mark.parametrize(("hard", "attempts"), [(2, 4), (3, 2)])
+def test_a_search_that_fails_for_nearly_all_of_many_shapes_ends(mixed, rng, monkeypatch, hard, attempts):
+    """With few shapes all attempts are made: from the one neighbour, and with twice as many steps."""
+    made = []
+
+    def counted(*given):
+        made.append(given)
+        return tried(*given)
+
+    tried = search._from_neighbour
+    monkeypatch.setattr(search, "_from_neighbour", counted)
+    monkeypatch.setattr(search, "AT_A_TIME", 2)
+    crumpled = mixed.mean + 0.8 * rng.standard_normal((hard, *mixed.mean.shape))
+    shapes = np.concatenate([[mixed.mean + 0.1 * mixed.fields[0]], crumpled])
+    found = logarithms(mixed.space, mixed.mean, shapes, 4, workers=1)
+    assert found.fallbacks == list(range(1, hard + 1))
+    assert len(made) == attempts
 
 
 def test_a_shape_that_is_not_finite_has_no_logarithm(mixed):
