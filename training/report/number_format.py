@@ -7,6 +7,8 @@ from typing import Any
 
 #: Most decimals of a number that is close to a whole.
 MOST_DIGITS = 15
+#: Smaller shares differ from 0 by nothing that anybody sees.
+TINY = 1e-5
 
 
 def flatten(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
@@ -43,7 +45,9 @@ def plain(value: float, digits: int) -> str:
 
 
 def percent(value: float, digits: int = 2) -> str:
-    """Format a share as a percentage with some significant digits."""
+    """Format a share as a percentage with some significant digits, or as less than `TINY`."""
+    if 0 < value < TINY:
+        return f"< {plain(100 * TINY, 1)}\N{NO-BREAK SPACE}%"
     return f"{plain(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 

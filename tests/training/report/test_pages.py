@@ -61,10 +61,10 @@ def test_no_r2_rounds_up_to_one(value: float, text: str) -> None:
     assert short_of(100 * value, 1, 100) != "100.0" or value == 1
 
 
-def test_numbers_have_no_exponents() -> None:
-    shown = [*map(percent, (3e-8, 0.00123, 1.0, 12.34)), size(2.34e9), duration(4e6)]
+def test_numbers_have_no_exponents_and_few_zeros() -> None:
+    shown = [*map(percent, (0, 3e-8, 0.000012, 0.00123, 1.0, 12.34)), size(2.34e9), duration(4e6)]
     assert [each.replace("\N{NO-BREAK SPACE}", " ") for each in shown] == [
-        "0.000003 %", "0.12 %", "100 %", "1200 %", "2340 MB", "1110 h",
+        "0 %", "< 0.001 %", "0.0012 %", "0.12 %", "100 %", "1200 %", "2340 MB", "1110 h",
     ]  # fmt: skip
 
 
