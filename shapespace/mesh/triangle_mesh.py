@@ -160,7 +160,7 @@ class TriangleMesh:
         areas = self.face_areas
         flat = np.flatnonzero(areas <= 1e-12 * areas.mean())
         if len(flat):
-            raise PlaceError(f"face {{face}} has no area ({len(flat)} such faces)", {"face": [int(flat[0])]})
+            raise PlaceError(f"face {{face}} has no area ({counted(len(flat), 'such face')})", {"face": [int(flat[0])]})
 
     @classmethod
     def from_arrays(cls, vertices: ArrayLike, faces: ArrayLike) -> TriangleMesh:

@@ -157,12 +157,18 @@ def _folded(reference: TriangleMesh, shapes: FloatArray, material: Material, fir
 
 
 def space_of(
-    reference: TriangleMesh, shapes: FloatArray, material: Material, steps: int, first_step: FirstStep
+    reference: TriangleMesh,
+    shapes: FloatArray,
+    material: Material,
+    steps: int,
+    first_step: FirstStep,
+    reached: float = 0,
 ) -> tuple[ShellSpace, FloatArray, FloatArray]:
-    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3). Raises ModeError
-    if the shapes have no mean.
+    """Return the space at the mean of shapes (n, V, 3), the mean (V, 3) and the logarithms (n, V, 3).
+
+    Raises ModeError if the shapes have no mean, or less than the share ``reached`` of them has a geodesic from it.
     """
-    found = centred_mean(reference, shapes, material, steps, first_step=first_step)
+    found = centred_mean(reference, shapes, material, steps, first_step=first_step, reached=reached)
     if found.status is not Status.CONVERGED:
         raise ModeError(f"{len(shapes)} shapes that are not held out have no mean: {found.reason}")
     space = ShellSpace(reference.with_vertices(found.vertices), material, first_step=first_step)

@@ -11,6 +11,7 @@ from shapespace.shell.space import FirstStep, ShellSpace
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.progress import waiting
 from shapespace.training.space.logarithms import logarithms
+from shapespace.training.space.modes import ModeError
 
 
 def centred_mean(
@@ -20,6 +21,7 @@ def centred_mean(
     steps: int,
     workers: int = -1,
     first_step: FirstStep = "centred",
+    reached: float = 0,
 ) -> Mean:
     """Compute the elastic mean, moved by the mean of the logarithms there.
 
@@ -28,13 +30,16 @@ def centred_mean(
     tenth, with twelve modes.
 
     The reference gives connectivity, shapes (n, V, 3) may be in any position, and ``steps`` is K of the logarithms.
-    Returns the mean with the status of the elastic mean; without an exponential it is the elastic mean itself.
+    Returns the mean with the status of the elastic mean; without an exponential it is the elastic mean itself. Raises
+    ModeError if less than the share ``reached`` of the shapes has a geodesic from the elastic mean.
     """
     with waiting("finding the mean shape"):
         found = elastic_mean(ShellSpace(reference, material), shapes)
     if found.status is not Status.CONVERGED:
         return found
     space = ShellSpace(reference.with_vertices(found.vertices), material, first_step=first_step)
-    common = logarithms(space, found.vertices, shapes, steps, workers).fields.mean(axis=0)
-    path = exponential(space, found.vertices, common, steps)
+    logs = logarithms(space, found.vertices, shapes, steps, workers)
+    if len(logs.fallbacks) > (1 - reached) * len(shapes):
+        raise ModeError(f"{len(logs.fallbacks)} of {len(shapes)} shapes have no geodesic from the mean")
+    path = exponential(space, found.vertices, logs.fields.mean(axis=0), steps)
     return replace(found, vertices=path.vertices[-1]) if path.converged else found

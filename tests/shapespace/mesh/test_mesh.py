@@ -112,7 +112,7 @@ MESH_REFUSALS = {
     "too many": ([*CORNERS, [1, 1, 1]], "vertex 4 belongs to no face (1 such vertex)"),
     "not a number": (changed(2, [0, np.nan, 0]), "vertex 2 has a coordinate that is not finite"),
     "infinite": (changed(1, [0, 0, -np.inf]), "vertex 1 has a coordinate that is not finite"),
-    "needle": (changed(3, [0.5, 0, 0]), "face 1 has no area (1 such faces)"),
+    "needle": (changed(3, [0.5, 0, 0]), "face 1 has no area (1 such face)"),
     "two in one place": (changed(2, CORNERS[0]), "face 0 has no area (2 such faces)"),
     "all in one place": (np.ones((4, 3)), "face 0 has no area (4 such faces)"),
 }

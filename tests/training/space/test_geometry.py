@@ -41,6 +41,16 @@ def test_shapes_that_bend_are_no_straight_lines_of_vertices(ellipsoid):
     assert choose_geometry(ModeSettings(log_steps=3), ellipsoid, shapes, Material()).steps == 3
 
 
+def test_exponentials_that_reach_only_half_of_the_shapes_are_not_compared(ellipsoid):
+    shapes = bent(ellipsoid, np.linspace(-1, 1, 8))
+    i, j, k = ellipsoid.faces[3]
+    assert "exponential" in choose_geometry(AUTO, ellipsoid, shapes, Material()).errors
+    shapes[::2, i] = (shapes[::2, j] + shapes[::2, k]) / 2 + 1e-7 * np.array([0.3, 1, 0.7])  # nearly without area
+    found = choose_geometry(AUTO, ellipsoid, shapes, Material())
+    assert found.errors.keys() == {"vertices", "differential", "nric"}
+    assert found.kind in found.errors
+
+
 @pytest.mark.parametrize(
     ("errors", "folded", "chosen"),
     [
