@@ -72,9 +72,8 @@ class PrincipalComponents:
         return self.mean + (rows @ some.T @ some).reshape(shapes.shape)
 
     def random(self, count: int, codes: int, rng: np.random.Generator) -> FloatArray:
-        """Draw shapes uniformly in the box of the first components' coefficients."""
-        some = self.coefficients[:, :count]
-        drawn = rng.uniform(some.min(axis=0), some.max(axis=0), (codes, count))
+        """Draw shapes uniformly in bounds around the first components' coefficients, wide as the bounds of a model."""
+        drawn = rng.uniform(*box_of(self.coefficients[:, :count]), (codes, count))
         return self.mean + (drawn @ self.axes[:count]).reshape(codes, *self.mean.shape)
 
 
