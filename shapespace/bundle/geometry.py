@@ -9,13 +9,12 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from shapespace.arrays import FloatArray, IntArray
 from shapespace.bundle.attributes import from_entry, surface_arrays
 from shapespace.bundle.schema import ARRAYS, ArrayType, Manifest
 from shapespace.mesh.attributes import MeshAttributes
-from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError
+from shapespace.mesh.prolongation import PREFIX, Prolongation, ProlongationError, nearest_counts
 from shapespace.mesh.triangle_mesh import MeshError, TriangleMesh
 
 #: Largest distance of a vertex of the fine mesh from the prolonged reference, as a fraction of the diagonal. It allows
@@ -37,9 +36,7 @@ class FineMesh:
     @cached_property
     def nearby(self) -> FloatArray:
         """Number of fine vertices whose nearest coarse vertex is each coarse vertex, at least 1, (V,)."""
-        own = self.prolong.coarse_vertices
-        nearest = cKDTree(self.reference.vertices[own]).query(self.reference.vertices)[1]
-        return np.maximum(np.bincount(nearest, minlength=len(own)), 1).astype(float)
+        return nearest_counts(self.reference.vertices, self.prolong.coarse_vertices)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,6 +45,15 @@ def faces_at_vertices(faces: IntArray, count: int) -> sp.csr_array:
     return sp.csr_array((np.ones(faces.size), (faces.ravel(), columns)), shape=(count, len(faces)))
 
 
+def nearest_counts(fine: FloatArray, own: IntArray) -> FloatArray:
+    """Return the number (V,) of fine vertices (Vf, 3) nearest to each coarse vertex, at least 1.
+
+    Coarse vertices are the fine vertices with the indices ``own`` (V,).
+    """
+    nearest = cKDTree(fine[own]).query(fine)[1]
+    return np.maximum(np.bincount(nearest, minlength=len(own)), 1).astype(float)
+
+
 class ProlongationError(ValueError):
     """The arrays are not a valid prolongation; the message says why."""
 

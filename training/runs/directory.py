@@ -16,6 +16,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from shapespace.arrays import FloatArray
+from shapespace.mesh.prolongation import nearest_counts
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.atomic_files import JsonFile, NpzFile, TextFile
 
@@ -265,6 +266,13 @@ class RunDirectory:
         """Read the shapes (n, V, 3) of the collection, without mirror images."""
         shapes = self.shapes.read()
         return shapes["vertices"][: shapes["original"].max() + 1]
+
+    def vertex_counts(self) -> FloatArray:
+        """Read how many vertices (V,) of the fine mesh are nearest to each vertex of the coarse mesh; 1 without one."""
+        reference = self.reference.read()
+        if "fine_vertices" not in reference:
+            return np.ones(len(reference["vertices"]))
+        return nearest_counts(reference["fine_vertices"], reference["fine_index"])
 
     def mean_mesh(self) -> TriangleMesh:
         """Read the coarse mesh at the mean shape."""

@@ -68,7 +68,8 @@ def _straighten(run: Run) -> None:
     """Write the same files for straight lines. Their modes are principal, and need no logarithm."""
     directory, chosen = run.directory, run.directory.geometry.read()
     shapes, centre = directory.shapes.read()["vertices"], directory.mean_mesh()
-    every = StraightLines.of(chosen["kind"], shapes, directory.reference_mesh())
+    counts = directory.vertex_counts()
+    every = StraightLines.of(chosen["kind"], shapes, directory.reference_mesh(), vertex_counts=counts)
     lines = every.first(chosen["count"])
     arrays = {
         "nric": lines.nric,

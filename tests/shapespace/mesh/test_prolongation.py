@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.mesh.coarsening import coarsen
-from shapespace.mesh.prolongation import Prolongation, ProlongationError
+from shapespace.mesh.prolongation import Prolongation, ProlongationError, nearest_counts
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from tests.shapespace.conftest import MESHES, bent, grid_faces
@@ -38,6 +38,16 @@ def test_exact_at_rest_and_at_the_coarse_vertices(pair, shape):
     np.testing.assert_allclose(pair.prolong(pair.coarse.vertices), pair.fine.vertices, atol=1e-12)
     np.testing.assert_allclose(pair.prolong(shape[pair.index])[pair.index], shape[pair.index], atol=1e-12)
     np.testing.assert_array_equal(pair.prolong.coarse_vertices, pair.index)
+
+
+def test_every_fine_vertex_counts_for_its_nearest_coarse_vertex(pair):
+    counts = nearest_counts(pair.fine.vertices, pair.index)
+    distances = np.linalg.norm(pair.fine.vertices[:, None] - pair.coarse.vertices, axis=2)
+    own = [np.isclose(row, row.min(), atol=1e-12) for row in distances]
+    most, fewest = np.sum(own, axis=0), np.sum([row & (row.sum() == 1) for row in own], axis=0)
+    assert counts.sum() == len(pair.fine.vertices)
+    assert (np.maximum(fewest, 1) <= counts).all()
+    assert (counts <= most).all()
 
 
 def test_moves_rigidly_and_grows_with_the_shape(pair, shape, move):

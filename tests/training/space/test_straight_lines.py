@@ -43,6 +43,20 @@ def test_unseen_blend_shapes_lie_on_straight_lines_of_vertices_in_any_pose(blend
     assert lines.explained[3:].sum() < 1e-3
 
 
+def test_vertices_count_as_often_as_the_fine_mesh_has_them(blends):
+    mesh, shapes = blends
+    counts = np.random.default_rng(3).integers(1, 30, len(mesh.vertices))
+    lines = StraightLines.of("vertices", shapes, mesh, vertex_counts=counts.astype(float))
+    repeated = np.repeat(lines.offsets(shapes).reshape(len(shapes), -1, 3), counts, axis=1)
+    u, s, _ = np.linalg.svd(repeated.reshape(len(shapes), -1), full_matrices=False)
+    assert lines.explained == pytest.approx((s**2 / (s**2).sum())[: len(lines)], abs=1e-9)
+    peaks = np.abs(u[:, :3]).max(axis=0)
+    assert np.abs(lines.coefficients[:, :3]) == pytest.approx(np.abs(u[:, :3]) / peaks, abs=1e-6)
+    assert lines.project(shapes)[:, :3] == pytest.approx(lines.coefficients[:, :3], abs=1e-6)
+    once = StraightLines.of("vertices", shapes, mesh, vertex_counts=np.ones(len(counts)))
+    assert (once.modes == StraightLines.of("vertices", shapes, mesh).modes).all()
+
+
 def test_lines_of_lengths_and_angles_bend_where_lines_of_vertices_cut_across(ellipsoid, family):
     ends = nric(family[[0, -1]], ellipsoid.connectivity)
     reconstruct = Reconstructor(ellipsoid)
