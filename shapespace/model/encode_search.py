@@ -276,19 +276,22 @@ class EncodeSearch:
         """Return the fit to vertices, or a fit from the nearest training shape, with the number of shapes that remain.
 
         Where faces have nearly collapsed, the fit to lengths and angles that the search began with may be far away. A
-        search from there is long. A short search may miss the effect of a stored training shape, which is nearer.
+        search from there is long. A short search may miss the effect of a stored training shape, which is nearer. From
+        a training shape that is nearer than the fit itself, a search always follows.
         """
-        left = SETTINGS.shapes + SETTINGS.inside - fit.iterations
-        if left < SETTINGS.fewest or fit.status is Status.DEADLINE or not len(known):
+        if fit.status is Status.DEADLINE or not len(known):
             return fit
         box = self._box_with(0.0)
         start = np.clip(self._fixed.into(known[0]), box.lower, box.upper)
-        if 0 < fit.iterations < SETTINGS.long:
-            if self.away(start) > SETTINGS.reach * self.away(fit.x):
-                return fit
-            other = replace(near, x=start)
+        there, here = self.away(start), self.away(fit.x)
+        left = SETTINGS.shapes + SETTINGS.inside - fit.iterations
+        short = 0 < fit.iterations < SETTINGS.long
+        if there < here:
+            left, other = max(left, SETTINGS.long), replace(near, x=start)
+        elif left < SETTINGS.fewest or (short and there > SETTINGS.reach * here):
+            return fit
         else:
-            other = self._from(start, box)
+            other = replace(near, x=start) if short else self._from(start, box)
         if np.abs(self._decoder.latents.shorter(other.x - near.x) / box.scale).max() < SETTINGS.different:
             return fit
         other = self._by_vertices(other, box, most=left)

@@ -303,8 +303,12 @@ def ending_elsewhere(
     return model, given
 
 
+@pytest.mark.parametrize(
+    ("spent", "most"),
+    [(SETTINGS.long, 30), (SETTINGS.shapes + SETTINGS.inside, SETTINGS.shapes + SETTINGS.inside + SETTINGS.long)],
+)
 def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_shape(
-    models: Path, monkeypatch: pytest.MonkeyPatch
+    models: Path, monkeypatch: pytest.MonkeyPatch, spent: int, most: int
 ) -> None:
     model, given = ending_elsewhere(models, monkeypatch, np.zeros_like)
     size = np.linalg.norm(np.ptp(given, axis=0))
@@ -312,13 +316,13 @@ def test_a_search_that_went_astray_begins_once_more_from_the_nearest_training_sh
 
     def stuck(self: EncodeSearch, near: Fit, *given: Any, **more: Any) -> Fit:
         if next(searches) == 0:
-            return replace(near, iterations=SETTINGS.long)
+            return replace(near, iterations=spent)
         return by_vertices(self, near, *given, **more)
 
     monkeypatch.setattr(EncodeSearch, "_by_vertices", stuck)
     found = model.encode(given, bounds="clamp")
     assert found.distances.mean() < 1e-5 * size
-    assert SETTINGS.long < found.iterations <= 30
+    assert spent < found.iterations <= most
     assert found.status is Status.CONVERGED
 
 
