@@ -84,9 +84,9 @@ distances from the training shapes.
 {known}
 
 *Random shapes*: the [specificity](../reference/glossary.md#specificity), ours / of components, for {codes} codes drawn
-evenly from the bounds, in the first fold. A smaller distance is better. Bounds of a model are a tenth wider than its
-training codes need. Until 29 November 2026 the components had no such margin, which favours them in all rows here. With
-the same margin, faces have 0.68 / 0.70 and hippocampi 2.73 / 2.77.
+evenly from the bounds, in the first fold. A smaller distance is better. Bounds are a tenth wider than the training
+codes need. In all rows but faces, the components had no such margin, which favours them: with it, hippocampi have 2.73 /
+2.77.
 
 ## How it was measured
 

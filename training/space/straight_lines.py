@@ -79,7 +79,7 @@ class StraightLines:
         """Find the mean of shapes (n, V, 3) in any position, and all principal modes of the shapes ``kept``, or of all.
 
         In the norm of lines of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once.
-        So the modes of a simplified mesh are nearly those of the fine mesh.
+        So a simplified mesh has nearly the modes of the fine mesh.
 
         Raises ModeError if the shapes have no such mean, or are all the same.
         """
