@@ -295,7 +295,7 @@ class EncodeSearch:
         if np.abs(self._decoder.latents.shorter(other.x - near.x) / box.scale).max() < SETTINGS.different:
             return fit
         other = self._by_vertices(other, box, most=left)
-        nearer = min((fit, other), key=lambda each: self.away(each.x))
+        nearer = other if self.away(other.x) < here else fit
         return replace(nearer, iterations=fit.iterations + other.iterations)
 
     def away(self, x: FloatArray) -> float:
