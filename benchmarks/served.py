@@ -85,8 +85,8 @@ distances from the training shapes.
 
 *Random shapes*: the [specificity](../reference/glossary.md#specificity), ours / of components, for {codes} codes drawn
 evenly from the bounds, in the first fold. A smaller distance is better. Bounds are a tenth wider than the training
-codes need. In all rows but faces, the components had no such margin, which favours them. With it, hippocampi have
-2.73 / 2.77.
+codes need. In all rows but faces, the components [had no such
+margin](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), which favours them.
 
 ## How it was measured
 
