@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,6 +44,9 @@ AS_GOOD, AS_GOOD_AS_NETWORKS = 1.02, 1.05
 #: Straight lines of vertices whose random shapes fold are chosen only if all other maps have at least this multiple of
 #: their error.
 FOLDED_BETTER = 1.03
+#: Where the map is chosen again without some of the shapes, maps with more than this multiple of the chosen map's error
+#: on all shapes are left out: the other shapes would not choose them either, and exponentials take long.
+HOPEFUL = 1.2
 #: Exponentials are compared only if at least this share of the shapes has a geodesic from the mean. Of heads whose
 #: eyelids and lips close, half have none, after long searches.
 REACHED = 2 / 3
@@ -80,6 +83,7 @@ def choose_geometry(
     material: Material,
     original_index: IntArray | None = None,
     first_step: FirstStep = "centred",
+    among: Sequence[Kind] = COST,
 ) -> GeometryChoice:
     """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
 
@@ -90,19 +94,31 @@ def choose_geometry(
     remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
     modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic from the mean.
 
-    ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
+    ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last. ``among`` are the maps
+    that "auto" compares, in the order of their cost. A single one is not compared.
     """
     original_index = np.arange(len(shapes)) if original_index is None else original_index
     if settings.geometry == "exponential":
         steps = time_steps(settings, reference, shapes, material, original_index, first_step)
         return GeometryChoice("exponential", steps)
     if settings.geometry != "auto":
-        lines = StraightLines.of(settings.geometry, shapes, reference)
-        lines.require_mean(reference)
-        return GeometryChoice(settings.geometry, 1, straight_count(settings, lines, shapes, original_index))
-    if original_index.max() + 1 < FOLDS:  # too few to choose
+        among = (settings.geometry,)
+    kind, *others = among
+    few = original_index.max() + 1 < FOLDS  # too few to compare exponentials
+    if kind == "exponential" or (few and "exponential" in others):
         return GeometryChoice("exponential", _many(settings, first_step))
-    return _Comparison(settings, reference, shapes, material, original_index, first_step).choice()
+    if not others:
+        lines = StraightLines.of(kind, shapes, reference)
+        lines.require_mean(reference)
+        return GeometryChoice(kind, 1, straight_count(settings, lines, shapes, original_index))
+    return _Comparison(settings, reference, shapes, material, original_index, first_step, among).choice()
+
+
+def hopeful(kind: Kind, errors: Mapping[Kind, float]) -> tuple[Kind, ...]:
+    """Return the maps that may be chosen without some of the shapes, from the map and the errors of all shapes."""
+    if not errors:
+        return COST
+    return tuple(each for each in COST if each in errors and errors[each] <= HOPEFUL * errors[kind])
 
 
 def _many(settings: ModeSettings, first_step: FirstStep) -> int:
@@ -139,9 +155,10 @@ class _Comparison:
         material: Material,
         original_index: IntArray,
         first_step: FirstStep,
+        among: Sequence[Kind],
     ) -> None:
         self._settings, self._reference, self._shapes, self._material = settings, reference, shapes, material
-        self._original_index = original_index
+        self._original_index, self._among = original_index, among
         used = original_index % -(-(original_index.max() + 1) // CHOICE_SHAPES) == 0
         self._some, self._own = shapes[used], np.unique(original_index[used], return_inverse=True)[1]
         self._steps, self._first_step = _many(settings, first_step), first_step
@@ -151,14 +168,14 @@ class _Comparison:
         """Compare the maps fold by fold, until the choice is certain."""
         settings, lines = self._settings, self._lines()
         maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
-        try:
-            at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-            asked = [mode_count(settings, *at, self._own)]
-            maps["exponential"] = partial(self._on_exponentials, *at)
-        except (ModeError, NotPositiveDefiniteError):  # exponentials have no mean, or reach too few shapes
-            if not lines:  # the stages that need a mean report it
-                return GeometryChoice("exponential", self._steps)
-            asked = []
+        asked = []
+        if "exponential" in self._among:
+            with suppress(ModeError, NotPositiveDefiniteError):  # they have no mean, or reach too few shapes
+                at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
+                asked.append(mode_count(settings, *at, self._own))
+                maps["exponential"] = partial(self._on_exponentials, *at)
+        if not maps:  # the stages that need a mean report it
+            return GeometryChoice("exponential", self._steps)
         every = folds(int(self._own.max()) + 1)
         own = {kind: straight_count(settings, each, self._shapes, self._original_index) for kind, each in lines.items()}
         count = max(1, min(*asked, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
@@ -200,6 +217,8 @@ class _Comparison:
         found: dict[StraightKind, StraightLines] = {}
         kinds: tuple[StraightKind, ...] = ("vertices", "differential", "nric")
         for kind in kinds:
+            if kind not in self._among:
+                continue
             try:
                 lines = StraightLines.of(kind, self._shapes, self._reference)
                 lines.require_mean(self._reference)

@@ -28,7 +28,7 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import Codes, ShapeMap, exponential_map, nearest_codes
 from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
-from shapespace.training.space.geometry import GeometryChoice, Kind, choose_geometry
+from shapespace.training.space.geometry import COST, GeometryChoice, Kind, choose_geometry
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
@@ -88,21 +88,23 @@ def held_out(
     first_step: FirstStep = "centred",
     *,
     remember: bool = True,
+    among: Sequence[Kind] = COST,
 ) -> HeldOut:
     """Find mean and modes without some shapes, and approximate these shapes.
 
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
-    number of the other shapes. The map from codes to shapes is as configured for the other shapes. ``steps`` is K, by
-    default as configured for these, and at most `LIGHT_STEPS`; K stands for exponentials. The map may ``remember`` the
-    shapes that it was found from, as bundles do. Raises ModeError if the other shapes have no mean, or no modes.
+    number of the other shapes. The map from codes to shapes is as configured for the other shapes; "auto" chooses
+    ``among`` some maps. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`; K stands for
+    exponentials. The map may ``remember`` the shapes that it was found from, as bundles do. Raises ModeError if the
+    other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
     kept, unseen = shapes[known], shapes[index]
     original_index = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
-        choice = choose_geometry(settings, reference, kept, material, original_index, first_step)
+        choice = choose_geometry(settings, reference, kept, material, original_index, first_step, among)
     else:
         choice = GeometryChoice("exponential", steps)
     space: _Exponentials | StraightLines

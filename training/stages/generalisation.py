@@ -6,6 +6,7 @@ from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.provenance import MADE_BY, made_by
 from shapespace.training.space.generalisation import FOLDS, folds, summary
+from shapespace.training.space.geometry import COST, hopeful
 from shapespace.training.space.held_out import held_out, joined
 from shapespace.training.space.modes import ModeError
 from shapespace.training.stages.stage import Run, Stage, StageWarning
@@ -14,19 +15,25 @@ from shapespace.training.stages.stage import Run, Stage, StageWarning
 def measure_generalisation(run: Run) -> None:
     """Write ``generalisation.json``: errors of modes and of principal components on shapes left out of training.
 
-    A fifth of the shapes is left out of everything: mean, logarithms, modes and their number. Below ten shapes, each
-    shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The space remembers
-    the other shapes if the bundle does. The same is measured with half as many modes. ``least-general.npz`` has the
-    shape with the largest error.
+    A fifth of the shapes is left out of mean, logarithms, modes and their number, and of the choice of the map. Maps
+    that were clearly worse on all shapes are not compared again. Below ten shapes, each shape is left out in its turn.
+    Exponentials stand for networks, in at most LIGHT_STEPS steps. The space remembers the other shapes if the bundle
+    does. The same is measured with half as many modes. ``least-general.npz`` has the shape with the largest error.
     """
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
     shapes, original = given["vertices"], given["original"]
     count, first_step = int(original.max()) + 1, run.config.exponential.first_step
+    chosen = directory.geometry.read_if_written()
     some = folds(count)[: 1 if count >= 2 * FOLDS else None]
     facts: dict[str, Any]
     try:
-        how: dict[str, Any] = {"original": original, "first_step": first_step, "remember": run.config.export.examples}
+        how: dict[str, Any] = {
+            "original": original,
+            "first_step": first_step,
+            "remember": run.config.export.examples,
+            "among": hopeful(chosen["kind"], chosen["errors"]) if chosen else COST,
+        }
         found = joined([held_out(reference, shapes, each, None, settings, material, **how) for each in some])
     except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use
         facts = {"failed": str(error)}

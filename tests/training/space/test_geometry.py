@@ -5,7 +5,7 @@ import pytest
 
 from shapespace.shell.energy import Material
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.geometry import COST, certain, cheapest, choose_geometry
+from shapespace.training.space.geometry import COST, certain, cheapest, choose_geometry, hopeful
 from shapespace.training.space.held_out import held_out
 from shapespace.training.space.modes import most_modes
 from tests.training.conftest import bent
@@ -36,6 +36,11 @@ def test_shapes_that_bend_are_no_straight_lines_of_vertices(ellipsoid):
     assert found.errors[found.kind] < 0.5 * found.errors["vertices"]
     few = choose_geometry(AUTO, ellipsoid, shapes[:4], Material())
     assert (few.kind, few.errors) == ("exponential", {}), "too few to tell"
+    among = ("vertices", "differential")
+    lines = choose_geometry(AUTO, ellipsoid, shapes[:4], Material(), among=among)
+    assert (lines.kind, tuple(lines.errors)) == ("differential", among), "as four shapes choose without exponentials"
+    single = [choose_geometry(AUTO, ellipsoid, shapes, Material(), among=(kind,)) for kind in ("nric", "exponential")]
+    assert [(each.kind, each.errors) for each in single] == [("nric", {}), ("exponential", {})], "no choice"
     asked = choose_geometry(ModeSettings(geometry="nric", count=2), ellipsoid, shapes, Material())
     assert (asked.kind, asked.count, asked.errors) == ("nric", 2, {})
     assert choose_geometry(ModeSettings(log_steps=3), ellipsoid, shapes, Material()).steps == 3
@@ -70,6 +75,13 @@ def test_exponentials_that_reach_only_half_of_the_shapes_are_not_compared(ellips
 def test_the_cheapest_map_is_chosen_that_is_as_good_as_the_others(errors, folded, chosen):
     kinds = zip(COST, errors, strict=True)
     assert cheapest({kind: error for kind, error in kinds if error is not None}, folded) == chosen
+
+
+def test_maps_that_were_clearly_worse_on_all_shapes_are_not_compared_again():
+    errors = {"vertices": 1.0, "differential": 1.19, "exponential": 1.3}
+    assert hopeful("vertices", errors) == ("vertices", "differential")
+    assert hopeful("differential", errors) == ("vertices", "differential", "exponential")
+    assert hopeful("exponential", {}) == COST, "nothing was compared"
 
 
 def test_folds_end_once_the_choice_is_certain(rng):

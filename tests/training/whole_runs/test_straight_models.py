@@ -11,6 +11,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import parse
+from shapespace.training.stages.generalisation import measure_generalisation
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run
 from tests.training.conftest import bent
@@ -96,6 +97,22 @@ def test_a_straight_line_model_is_served_without_training(
     report = _report(run)
     assert "Codes make shapes by straight lines of " in report
     assert "PCA with memory" in report
+
+
+def test_unseen_shapes_do_not_try_maps_that_were_clearly_worse_on_all_shapes(
+    ellipsoid: TriangleMesh, tmp_path: Path
+) -> None:
+    data = tmp_path / "shapes.npz"
+    np.savez(data, vertices=bent(ellipsoid, np.linspace(-1, 1, 6)), faces=ellipsoid.faces)
+    text = CONFIG.format(data=json.dumps(str(data)), geometry="auto", count=2, examples="false", decoder="false")
+    run = Run(tmp_path / "run", parse(text, "straight.toml"), text, tmp_path / "models")
+    execute(run, "mean")
+    chosen = run.directory.geometry.read()
+    assert chosen["kind"] != "nric"
+    worse = {kind: 2 * chosen["errors"]["nric"] for kind in chosen["errors"] if kind != "nric"}
+    run.directory.geometry.write(chosen | {"kind": "nric", "errors": chosen["errors"] | worse})
+    measure_generalisation(run)
+    assert run.directory.generalisation.read()["maps"] == ["nric"]
 
 
 def test_a_run_says_that_there_are_fewer_modes_than_asked_for(
