@@ -20,6 +20,7 @@ from benchmarks.generalisation import SIMPLE, against_the_best
 from benchmarks.pages import ROOT, table
 from benchmarks.results import COLLECTIONS, MANNEQUIN, open_run
 from shapespace.arrays import FloatArray
+from shapespace.counted import counted
 from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.runs.config import parse
@@ -294,7 +295,7 @@ def write_page() -> None:
         codes=RANDOM,
         finding=against_the_best(list(shares.values())),
         simplest="The best simple model is "
-        + ", ".join(f"{rival} in {count} rows" for rival, count in rivals.most_common())
+        + ", ".join(f"{rival} in {counted(count, 'row')}" for rival, count in rivals.most_common())
         + ".",
         incomplete=incomplete(rows),
         measured=pages.measured_with(*(files[name] for name in rows)),

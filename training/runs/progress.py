@@ -28,14 +28,14 @@ SHARES = {
 #: The same for straight lines, which need no samples.
 STRAIGHT_SHARES = {
     "ingest": 5,
-    "mean": 33,
+    "mean": 52,
     "modes": 1,
     "factors": 0,
     "samples": 0,
     "networks": 0,
-    "generalisation": 32,
-    "evaluation": 3,
-    "export": 26,
+    "generalisation": 12,
+    "evaluation": 5,
+    "export": 25,
 }
 
 Item = TypeVar("Item")

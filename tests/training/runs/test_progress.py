@@ -52,8 +52,8 @@ def test_a_stage_has_a_place_and_an_estimate_from_the_stages_before() -> None:
     assert progress.stage_place("samples", twice, names) == f"stage 5 of 9, about {4 * left / 60:.0f} h left"
     brief = {name: seconds / 100 for name, seconds in done.items()}
     assert progress.stage_place("samples", brief, names) == "stage 5 of 9, less than a minute left"
-    measured = {"ingest": 4.0, "mean": 113.0}  # of straight lines; 201 s were left
-    assert progress.stage_place("modes", measured, names, straight=True) == "stage 3 of 9, about 4 min left"
+    measured = {"ingest": 4.0, "mean": 113.0}  # of straight lines; 105 s were left
+    assert progress.stage_place("modes", measured, names, straight=True) == "stage 3 of 9, about 2 min left"
     # A product by design skips three stages, and a later stage that was done before says nothing about this one.
     few = [name for name in names if name not in ("mean", "modes", "generalisation")]
     assert (
