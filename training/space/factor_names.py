@@ -60,13 +60,14 @@ def names(
     squares /= squares.sum(axis=1, keepdims=True)
     shares = np.array([squares[list(modes)].mean(axis=0) for modes in groups])
     centres = [_offset(share, mean)[0] for share in shares]
-    found = [
+    plain = [
         (*_place(share, mean), _verb(motion(mean, fields[modes[0]], squares[modes[0]])))
         for share, modes in zip(shares, groups, strict=True)
     ]
-    for name, count in Counter(found).items():
+    found = list(plain)
+    for name, count in Counter(plain).items():
         if count > 1:
-            alike = [k for k, each in enumerate(found) if each == name]
+            alike = [k for k, each in enumerate(plain) if each == name]
             values = {pair: [centres[k][axis] for k in alike] for axis, pair in SIDES.items() if not {*pair} & {*name}}
             values["inner", "outer"] = [float(np.linalg.norm(centres[k])) for k in alike]
             for k, words in zip(alike, _told_apart(values, list(range(count))), strict=True):

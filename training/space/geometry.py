@@ -32,7 +32,9 @@ from shapespace.training.space.generalisation import (
     time_steps,
     vertex_distances,
 )
-from shapespace.training.space.modes import ModeError, coefficients, left_of_held_out, mode_count, pga, worthwhile
+from shapespace.training.space.modes import ModeCount, ModeError, coefficients, mode_count, worthwhile_with_soft
+from shapespace.training.space.soft_fields import SoftFields, soft_fields
+from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
@@ -52,6 +54,8 @@ HOPEFUL = 1.2
 REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
+#: Modes in the comparison.
+DENSE = ModeSettings(sparsity=0, norm="vertices")
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -69,6 +73,7 @@ class GeometryChoice:
     # mean distance of each map from these shapes, as a share of the diagonal
     errors: dict[Kind, float] = field(default_factory=dict)
     folded: float = 0.0  # share of random shapes that fold on straight lines of vertices
+    soft_share: float = 0.0  # variance that soft fields add to straight lines, as a share of the shapes' variance
 
     @property
     def light_steps(self) -> int:
@@ -89,7 +94,8 @@ def choose_geometry(
 
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
-    number of modes, the smallest that one of them would have, and with few shapes also half as many. The cheapest
+    number of modes, the smallest that one of them would have, and with few shapes also half as many. Soft fields are
+    among them where the shapes support fewer modes than pay. The cheapest
     map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above exponentials. No map
     remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
     modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic from the mean.
@@ -110,7 +116,8 @@ def choose_geometry(
     if not others:
         lines = StraightLines.of(kind, shapes, reference)
         lines.require_mean(reference)
-        return GeometryChoice(kind, 1, straight_count(settings, lines, shapes, original_index))
+        own = straight_count(settings, lines, shapes, original_index, material)
+        return GeometryChoice(kind, 1, own.count, soft_share=own.soft.share if own.soft else 0.0)
     return _Comparison(settings, reference, shapes, material, original_index, first_step, among).choice()
 
 
@@ -128,15 +135,39 @@ def _many(settings: ModeSettings, first_step: FirstStep) -> int:
     return many_steps(first_step)
 
 
-def straight_count(settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray) -> int:
+def straight_count(
+    settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray, material: Material
+) -> ModeCount:
     """Return the number of modes of straight lines, as configured or by cross-validation.
 
-    Errors are measured on vertices at the mean, see `mode_count`.
+    Errors are measured on vertices at the mean, see `worthwhile_with_soft`.
     """
     if settings.count != "auto":
-        return max(1, min(settings.count, len(lines)))
-    motions = lines.motions(shapes)
-    return min(worthwhile(left_of_held_out(motions @ motions.T, original_index), original_index), len(lines))
+        return ModeCount(max(1, min(settings.count, len(lines))))
+    found = worthwhile_with_soft(lines.motions(shapes), lambda: soft_fields_of(lines, material), original_index)
+    return found if found.soft else ModeCount(min(found.count, len(lines)))
+
+
+def straight_lines(
+    choice: GeometryChoice,
+    shapes: FloatArray,
+    reference: TriangleMesh,
+    material: Material,
+    vertex_counts: FloatArray | None = None,
+) -> StraightLines:
+    """Return the chosen straight lines of shapes (n, V, 3), along all their modes. ``vertex_counts`` as for lines."""
+    if choice.kind == "exponential":
+        raise ValueError("exponentials are no straight lines")
+    lines = StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts)
+    if not choice.soft_share:
+        return lines
+    soft = SoftFields(soft_fields_of(lines, material), choice.soft_share)
+    return StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts, soft=soft)
+
+
+def soft_fields_of(lines: StraightLines, material: Material) -> FloatArray:
+    """Return the soft fields (p, V, 3) at the mean of straight lines."""
+    return soft_fields(ShellSpace(lines.reference, material), lines.reference.vertices)
 
 
 #: Map from indices of the shapes that modes are found from, indices of unseen shapes, and a number of modes, to the
@@ -167,18 +198,24 @@ class _Comparison:
     def choice(self) -> GeometryChoice:
         """Compare the maps fold by fold, until the choice is certain."""
         settings, lines = self._settings, self._lines()
-        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
-        asked = []
+        own = {
+            kind: straight_count(settings, each, self._shapes, self._original_index, self._material)
+            for kind, each in lines.items()
+        }
+        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind, each.soft) for kind, each in own.items()}
+        asked = list(own.values())
         if "exponential" in self._among:
             with suppress(ModeError, NotPositiveDefiniteError):  # they have no mean, or reach too few shapes
                 at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-                asked.append(mode_count(settings, *at, self._own))
-                maps["exponential"] = partial(self._on_exponentials, *at)
+                bent = mode_count(settings, *at, self._own)
+                asked.append(bent)
+                maps["exponential"] = partial(self._on_exponentials, *at, bent.soft)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
         every = folds(int(self._own.max()) + 1)
-        own = {kind: straight_count(settings, each, self._shapes, self._original_index) for kind, each in lines.items()}
-        count = max(1, min(*asked, *own.values(), *(int((~np.isin(self._own, index)).sum()) - 1 for index in every)))
+        # Without soft fields there are fewer modes than shapes.
+        supported = [int((~np.isin(self._own, index)).sum()) - 1 for index in every if not all(x.soft for x in asked)]
+        count = max(1, min(*(each.count for each in asked), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
         folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
@@ -197,19 +234,30 @@ class _Comparison:
             kind = cheapest(errors, folded)
             if held_out >= ENOUGH and certain(away, kind):
                 break
-        steps, modes = (self._steps, None) if kind == "exponential" else (1, own[kind])
-        return GeometryChoice(kind, steps, modes, count, held_out, errors, folded)
+        if kind == "exponential":
+            return GeometryChoice(kind, self._steps, None, count, held_out, errors, folded)
+        share = soft.share if (soft := own[kind].soft) else 0.0
+        return GeometryChoice(kind, 1, own[kind].count, count, held_out, errors, folded, share)
 
-    def _on_lines(self, kind: StraightKind, kept: IntArray, index: IntArray, count: int) -> FloatArray:
+    def _on_lines(
+        self, kind: StraightKind, soft: SoftFields | None, kept: IntArray, index: IntArray, count: int
+    ) -> FloatArray:
         """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
-        lines = StraightLines.of(kind, self._some, self._reference, kept)
+        lines = StraightLines.of(kind, self._some, self._reference, kept, soft=soft)
         return lines.first(count).nearest(self._some[index]).vertices
 
     def _on_exponentials(
-        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, kept: IntArray, index: IntArray, count: int
+        self,
+        space: ShellSpace,
+        mean: FloatArray,
+        fields: FloatArray,
+        soft: SoftFields | None,
+        kept: IntArray,
+        index: IntArray,
+        count: int,
     ) -> FloatArray:
         """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
-        modes = pga(space, mean, fields[kept], count, "vertices").vertices
+        modes = find_modes(DENSE, space, mean, fields[kept], count, soft=soft).vertices
         start, _ = coefficients(space, mean, fields[index], modes, "vertices")
         return nearest_codes(space, mean, modes, self._some[index], start, self._light).vertices
 

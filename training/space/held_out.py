@@ -28,7 +28,7 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import Codes, ShapeMap, exponential_map, nearest_codes
 from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
-from shapespace.training.space.geometry import COST, GeometryChoice, Kind, choose_geometry
+from shapespace.training.space.geometry import COST, GeometryChoice, Kind, choose_geometry, straight_lines
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
@@ -113,14 +113,14 @@ def held_out(
         space = _Exponentials(settings, reference, kept, unseen, original_index, material, steps, first_step)
         count = space.count if choice.count is None else choice.count
     else:
-        space = StraightLines.of(choice.kind, kept, reference)
+        space = straight_lines(choice, kept, reference, material)
         count = choice.count or len(space)
     workers = -1 if choice.kind == "exponential" else 1  # shapes of straight lines take less time than processes
     rivals = simple_models(reference, kept, original[known] == known)
     reached, stuck = [], []
     near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
     for each in [-(-count // 2), count] if counts is None else counts:
-        some = space.first(min(each, len(kept) - 1))
+        some = space.first(min(each, len(space)))
         found = some.nearest(unseen)
         if remember:
             memory = RememberingMap(some.shape, some.codes_of(kept), kept, some.sizes, workers)
@@ -191,16 +191,18 @@ class _Exponentials:
         # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far
         # shape.
         self._towards = logarithms(self._space, self._mean, unseen, steps).fields
+        own = mode_count(settings, self._space, self._mean, self._fields, original_index)
+        self.count, self._soft = own.count, own.soft  # as configured
 
-    @property
-    def count(self) -> int:
-        """Number of modes, as configured."""
-        return mode_count(self._settings, self._space, self._mean, self._fields, self._original_index)
+    def __len__(self) -> int:
+        """Largest number of modes."""
+        return max(self.count, len(self._fields) - 1)
 
     def first(self, count: int) -> _Exponentials:
         """Return the exponentials along this number of modes."""
         found = copy(self)
-        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index)
+        soft = self._soft
+        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index, soft)
         found._modes, found._codes = modes.vertices, modes.coefficients
         found.shape = exponential_map(self._space, self._mean, found._modes, self._steps)
         return found

@@ -18,6 +18,7 @@ nearly zero.
 `sparse_modes` finds modes that each move a small part of the surface.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -32,6 +33,7 @@ from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.shell.space import ShellPoint, ShellSpace
 from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space.soft_fields import SOFT_SHARE, SoftFields, soft_fields
 
 #: The norm of the misfit between modes and logarithms.
 Norm = Literal["mixed", "vertices", "shell"]
@@ -45,6 +47,8 @@ LOCALISED_PART = 0.95
 INNER_FOLDS = 5
 #: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
 WORTH = 0.005
+#: Index of the original of a field that is never held out.
+NEVER_HELD_OUT = -1
 
 
 class ModeError(ValueError):
@@ -65,6 +69,7 @@ class Modes:
     explained: float  # share of ``Σ ‖v^i‖²`` that the projections keep
     converged: bool = True  # whether the iteration converged
     sparsity: float = 0.0  # λ, see ``spga``
+    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by soft fields, if there are any
     # one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective = misfit +
     # penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``
     history: list[dict[str, float]] = field(default_factory=list, repr=False)
@@ -81,17 +86,24 @@ def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, nor
     return problem.modes(problem.principal(count)[0])
 
 
+@dataclass(frozen=True, eq=False)
+class ModeCount:
+    """The number of modes, and the soft fields that some of them come from."""
+
+    count: int
+    soft: SoftFields | None = None
+
+
 def mode_count(
     settings: ModeSettings,
     space: ShellSpace,
     mean: FloatArray,
     fields: FloatArray,
     original_index: IntArray | None = None,
-) -> int:
-    """Return the number of modes, as configured or by cross-validation, and less than n.
+) -> ModeCount:
+    """Return the number of modes, as configured and less than n, or by cross-validation with `worthwhile`.
 
-    The choice m minimises ``error(m) + WORTH · m`` and is at most `most_modes`. The error is the distance between
-    held-out logarithms and the span of m principal modes of the other shapes, as a share of the logarithms' length. No
+    The error is the distance between held-out logarithms and the span of principal modes of the other shapes. No
     exponentials are computed.
 
     Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. ``original_index`` (n,)
@@ -99,27 +111,65 @@ def mode_count(
     if the fields can't be used.
     """
     if settings.count != "auto":
-        return max(1, min(settings.count, len(fields) - 1))
+        return ModeCount(max(1, min(settings.count, len(fields) - 1)))
     problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
-    return worthwhile(problem.left_of_held_out(original_index), original_index)
+    root = np.sqrt(problem.areas)
+    if settings.norm == "shell":  # the paper's
+        return ModeCount(worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index))
+    return worthwhile_with_soft(problem.D, lambda: soft_fields(space, mean), original_index, root)
 
 
-def worthwhile(left: FloatArray, original_index: IntArray | None = None) -> int:
-    """Return the number of modes that pay, see `mode_count`, from square errors (n, n) of held-out shapes."""
-    errors = np.sqrt(left)[:, : 1 + most_modes(len(left), original_index)].mean(axis=0)
+def worthwhile_with_soft(
+    rows: FloatArray,
+    soft: Callable[[], FloatArray],
+    original_index: IntArray | None = None,
+    root: FloatArray | float = 1.0,
+) -> ModeCount:
+    """Return the number of modes that pay for motions (n, 3V) of vertices, from their mean to shapes.
+
+    Where the shapes support fewer modes than pay, there are further modes from ``soft`` fields (p, V, 3). Their
+    variance is `SOFT_SHARE` of what held-out shapes have outside the span of the other shapes. ``root`` are square
+    roots (3V,) of weights.
+    """
+    rows = rows * root
+    n = len(rows)
+    original_index = np.arange(n) if original_index is None else original_index
+    left = left_of_held_out(rows @ rows.T, original_index)
+    count, most = worthwhile(left, original_index), most_modes(n, original_index)
+    if count < most or int(original_index.max()) + 1 < INNER_FOLDS:
+        return ModeCount(count)
+    share = SOFT_SHARE * float(left[:, most].sum() / left[:, 0].sum())
+    if share < NEGLIGIBLE:
+        return ModeCount(count)
+    found = SoftFields(soft(), share)
+    others = found.fields.reshape(len(found.fields), -1) * root
+    every = np.concatenate([rows, found.scale(rows, others) * others])
+    whose = np.concatenate([original_index, np.full(len(found.fields), NEVER_HELD_OUT)])
+    left = left_of_held_out(every @ every.T, whose)[:n]
+    more = worthwhile(left, original_index, len(every) - 1)
+    return ModeCount(more, found) if more > count else ModeCount(count)
+
+
+def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: int | None = None) -> int:
+    """Return the number of modes that pay, from square errors (n, q) of held-out shapes for 0, 1, 2 … modes.
+
+    The choice m minimises ``error(m) + WORTH · m``, with the error as a share of the shapes' distance from the mean. It
+    is at most `most_modes`, or ``most``.
+    """
+    most = most_modes(len(left), original_index) if most is None else most
+    errors = np.sqrt(left)[:, : 1 + most].mean(axis=0)
     return max(1, int(np.argmin(errors / errors[0] + WORTH * np.arange(len(errors)))))
 
 
 def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -> FloatArray:
     """Return square errors (n, n) of held-out vectors for 0, 1, 2 … principal modes of the other vectors.
 
-    ``gram`` (n, n) has the inner products of the vectors.
+    ``gram`` (n, n) has the inner products of the vectors. Rows of vectors that are never held out are 0.
     """
     n = len(gram)
     original_index = np.arange(n) if original_index is None else original_index
-    parts = min(INNER_FOLDS, int(original_index.max()) + 1)
     left = np.zeros((n, n))
-    for held in (np.flatnonzero(original_index % parts == part) for part in range(parts)):
+    for held in map(np.flatnonzero, inner_folds(original_index)):
         kept = np.delete(np.arange(n), held)
         values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
         some = np.flatnonzero(values > NEGLIGIBLE * gram.trace())[::-1]
@@ -127,6 +177,13 @@ def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -
         along[:, 1 : 1 + len(some)] = (gram[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
         left[held] = np.maximum(gram[held, held][:, None] - np.cumsum(along, axis=1), 0)
     return left
+
+
+def inner_folds(original_index: IntArray) -> list[NDArray[np.bool_]]:
+    """Return masks (n,) of the fields that are held out together."""
+    parts = min(INNER_FOLDS, int(original_index.max()) + 1)
+    own = original_index != NEVER_HELD_OUT
+    return [own & (original_index % parts == part) for part in range(parts)]
 
 
 def most_modes(count: int, original_index: IntArray | None = None) -> int:
@@ -225,10 +282,6 @@ class ModeProblem:
         B = D @ self.MD
         W = np.linalg.lstsq(D @ (self.M @ D.T), B, rcond=NEGLIGIBLE)[0]
         return W, float(np.vdot(W, B)) / self.total
-
-    def left_of_held_out(self, original_index: IntArray | None = None) -> FloatArray:
-        """Return square errors (n, n) of held-out logarithms for 0, 1, 2 … principal modes of the other logarithms."""
-        return left_of_held_out(self.D @ self.MD, original_index)
 
     def modes(self, D: FloatArray, converged: bool = True, history: list[dict[str, float]] | None = None) -> Modes:
         """Project the logarithms onto the span of fields (m, 3V); drop negligible modes; scale, orient and sort."""

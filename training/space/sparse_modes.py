@@ -44,15 +44,18 @@ from shapespace.solve.cholesky import analyse
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.modes import (
-    INNER_FOLDS,
     NEGLIGIBLE,
+    NEVER_HELD_OUT,
     ModeProblem,
     Modes,
     Norm,
+    coefficients,
+    inner_folds,
     localisation,
     pga,
     validation_norm,
 )
+from shapespace.training.space.soft_fields import SoftFields
 
 #: ADMM iterations on modes before the next modes, and their over-relaxation, between 1 and 2.
 ADMM_ITERATIONS, OVERRELAXATION = 5, 1.6
@@ -82,10 +85,21 @@ def find_modes(
     fields: FloatArray,
     count: int,
     original_index: IntArray | None = None,
+    soft: SoftFields | None = None,
 ) -> Modes:
-    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured. Raises ModeError if the count or
-    the sparsity is not possible.
+    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3) and of soft fields, as configured. Raises ModeError
+    if the count or the sparsity is not possible.
     """
+    if soft:
+        n, original_index = len(fields), np.arange(len(fields)) if original_index is None else original_index
+        problem = ModeProblem(space, mean, np.concatenate([fields, soft.fields]), 1, "vertices")
+        rows = problem.D * np.sqrt(problem.areas)
+        every = np.concatenate([fields, soft.scale(rows[:n], rows[n:]) * soft.fields])
+        whose = np.concatenate([original_index, np.full(len(soft.fields), NEVER_HELD_OUT)])
+        found = find_modes(settings, space, mean, every, count, whose)
+        codes, explained = coefficients(space, mean, fields, found.vertices, settings.norm)
+        spread = np.sqrt((found.coefficients[n:] ** 2).sum(axis=0) / n)
+        return replace(found, coefficients=codes, explained=explained, spread=spread)
     if settings.sparsity == 0:
         return pga(space, mean, fields, count, settings.norm)
     return spga(
@@ -218,9 +232,8 @@ def _chosen_sparsity(
     """Return the largest sparsity that costs little on held-out shapes, see `SPARSITIES`; 0 if there is none."""
     original_index = np.arange(len(fields)) if original_index is None else original_index
     originals = int(original_index.max()) + 1
-    parts = min(INNER_FOLDS, originals)
-    folds = [original_index % parts == part for part in range(parts if parts > 1 else 0)]
-    enough = -(-HELD_OUT * parts // originals)
+    folds = inner_folds(original_index) if originals > 1 else []
+    enough = -(-HELD_OUT * len(folds) // originals)
     trials = [_Trial(space, mean, fields, held, min(count, int((~held).sum())), norm) for held in folds[:enough]]
     if not trials:
         return 0.0

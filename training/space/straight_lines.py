@@ -33,6 +33,7 @@ from shapespace.training.runs.workers import run
 from shapespace.training.space.codes import Codes, NearestCode, gathered, nearest_code
 from shapespace.training.space.face_coordinates import FaceCoordinates
 from shapespace.training.space.modes import NEGLIGIBLE, ModeError
+from shapespace.training.space.soft_fields import SoftFields
 
 StraightKind = Literal["vertices", "nric", "differential"]
 #: Tolerance of vertices from lengths and angles, as a share of the diagonal.
@@ -44,6 +45,8 @@ ITERATIONS = 60
 ROUNDING = 1e-9
 #: Smallest area of a face of the mean, as a share of its area in the reference: below it the mean has collapsed.
 LEAST_AREA = 1e-3
+#: Largest motion of a vertex, as a share of the diagonal, where coordinates are differentiated.
+SMALL_MOTION = 1e-4
 #: Rounds of the mean of differential coordinates. The last moves no vertex by more than 1e-5 of the diagonal.
 ROUNDS = 6
 
@@ -62,6 +65,7 @@ class StraightLines:
     weights: FloatArray  # (q,) weights of squares in the norm
     coefficients: FloatArray  # (n, m) orthogonal projections of the shapes
     eta: float = DEFAULT_ETA  # weight of the angles
+    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by soft fields, if there are any
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name not in ("_reconstruct", "differential")}
@@ -75,8 +79,10 @@ class StraightLines:
         kept: IntArray | None = None,
         eta: float = DEFAULT_ETA,
         vertex_counts: FloatArray | None = None,
+        soft: SoftFields | None = None,
     ) -> StraightLines:
-        """Find the mean of shapes (n, V, 3) in any position, and all principal modes of the shapes ``kept``, or of all.
+        """Find the mean of shapes (n, V, 3) in any position, and all principal modes of the shapes ``kept``, or of all,
+        and of ``soft`` fields.
 
         In the norm of lines of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once.
         So a simplified mesh has nearly the modes of the fine mesh.
@@ -113,6 +119,9 @@ class StraightLines:
             mean = centre.ravel()
         offsets = (rows - mean) * np.sqrt(weights)
         some = offsets if kept is None else offsets[kept]
+        if soft:
+            slopes = _slopes(kind, soft.fields, reference.with_vertices(centre)) * np.sqrt(weights)
+            some = np.concatenate([some, soft.scale(some, slopes) * slopes])
         u, s, axes = np.linalg.svd(some, full_matrices=False)
         number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
         size = 1.0 if kind == "differential" else np.sqrt((mean**2) @ weights)
@@ -120,6 +129,8 @@ class StraightLines:
             raise ModeError("there are no modes: all shapes are the same as the mean")
         coefficients = (u * s)[:, :number]
         peaks = coefficients[np.abs(coefficients).argmax(axis=0), np.arange(number)]
+        n = len(offsets) if kept is None else len(kept)
+        spread = np.sqrt((coefficients[n:] ** 2).sum(axis=0) / n) / np.abs(peaks) if soft else None
         plain = np.divide(axes[:number], np.sqrt(weights), out=np.zeros_like(axes[:number]), where=weights > 0)
         return cls(
             kind=kind,
@@ -127,8 +138,9 @@ class StraightLines:
             mean=mean,
             modes=plain * peaks[:, None],
             weights=weights,
-            coefficients=coefficients / peaks,
+            coefficients=coefficients[:n] / peaks,
             eta=eta,
+            spread=spread,
         )
 
     def __len__(self) -> int:
@@ -142,7 +154,8 @@ class StraightLines:
 
     def first(self, count: int) -> StraightLines:
         """Return the lines along the strongest modes alone."""
-        return replace(self, modes=self.modes[:count], coefficients=self.coefficients[:, :count])
+        spread = None if self.spread is None else self.spread[:count]
+        return replace(self, modes=self.modes[:count], coefficients=self.coefficients[:, :count], spread=spread)
 
     @cached_property
     def explained(self) -> FloatArray:
@@ -240,6 +253,17 @@ class StraightLines:
 
 def _nearest(lines: StraightLines, item: tuple[FloatArray, FloatArray]) -> NearestCode:
     return nearest_code(lines.shape, *item)
+
+
+def _slopes(kind: StraightKind, fields: FloatArray, mesh: TriangleMesh) -> FloatArray:
+    """Return the derivatives (p, q) of the coordinates of a mesh along vertex fields (p, V, 3)."""
+    if kind == "vertices":
+        return fields.reshape(len(fields), -1)
+    if kind == "nric":
+        return (NRICJacobian(mesh.connectivity)(mesh.vertices) @ fields.reshape(len(fields), -1).T).T
+    coordinates, size = FaceCoordinates(mesh), SMALL_MOTION * mesh.diagonal / np.abs(fields).max()
+    there, back = (coordinates(mesh.vertices + sign * size * fields) for sign in (1, -1))
+    return (there - back) / (2 * size)
 
 
 def _about_their_mean(shapes: FloatArray, reference: TriangleMesh) -> FaceCoordinates:

@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.counted import counted
 from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.codes import Codes, box_of, enough_steps, nearest_codes
 from shapespace.training.space.generalisation import summary, vertex_distances
+from shapespace.training.space.geometry import GeometryChoice, straight_lines
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import localisation, mode_count, pga
+from shapespace.training.space.modes import localisation, mode_count
+from shapespace.training.space.soft_fields import DEVIATIONS
 from shapespace.training.space.sparse_modes import find_modes
-from shapespace.training.space.straight_lines import StraightLines
 from shapespace.training.stages.stage import Run, Stage, StageWarning, against_failures, listed
 
 
@@ -33,9 +35,13 @@ def decompose(run: Run) -> None:
     norm = WeightedNorm.of(centre, config.material.eta)
     steps = directory.log_steps()
     found = logarithms(space, centre.vertices, shapes, steps)
-    count = mode_count(settings, space, centre.vertices, found.fields, original_index)
-    dense = pga(space, centre.vertices, found.fields, count, settings.norm)
-    sparse = find_modes(settings, space, centre.vertices, found.fields, count, original_index)
+    own = mode_count(settings, space, centre.vertices, found.fields, original_index)
+    count = own.count
+    plain = settings.model_copy(update={"sparsity": 0})
+    dense, sparse = (
+        find_modes(each, space, centre.vertices, found.fields, count, original_index, own.soft)
+        for each in (plain, settings)
+    )
     shooting = steps
     if settings.log_steps == "auto" and space.first_step == "centred" and steps > 1:
         shooting = enough_steps(space, centre.vertices, sparse.vertices, sparse.coefficients)
@@ -61,16 +67,16 @@ def decompose(run: Run) -> None:
         "steps": list(found.steps),
         "via": list(found.via),
     }
-    _write(directory, arrays, codes, facts, reasons=list(found.reasons), history=sparse.history)
+    _write(directory, arrays, codes, sparse.spread, facts, reasons=list(found.reasons), history=sparse.history)
 
 
 def _straighten(run: Run) -> None:
     """Write the same files for straight lines. Their modes are principal, and need no logarithm."""
-    directory, chosen = run.directory, run.directory.geometry.read()
+    directory, chosen = run.directory, GeometryChoice(**run.directory.geometry.read())
     shapes, centre = directory.shapes.read()["vertices"], directory.mean_mesh()
-    counts = directory.vertex_counts()
-    every = StraightLines.of(chosen["kind"], shapes, directory.reference_mesh(), vertex_counts=counts)
-    lines = every.first(chosen["count"])
+    material, counts = run.config.shell_material, directory.vertex_counts()
+    every = straight_lines(chosen, shapes, directory.reference_mesh(), material, counts)
+    lines = every.first(chosen.count or len(every))
     arrays = {
         "nric": lines.nric,
         "vertices": lines.fields,
@@ -86,20 +92,29 @@ def _straighten(run: Run) -> None:
         "sparsity": 0.0,
         "pga_explained": explained,
         "linearised_logarithms": 0,
-        "asked": chosen["count"] if run.config.modes.count == "auto" else run.config.modes.count,
+        "asked": len(lines) if run.config.modes.count == "auto" else run.config.modes.count,
         "log_steps": 1,
         "steps": [1] * len(shapes),
     }
-    _write(directory, arrays, lines.nearest(shapes), facts, history=[])
+    _write(directory, arrays, lines.nearest(shapes), lines.spread, facts, history=[])
 
 
 def _write(
-    directory: RunDirectory, arrays: Mapping[str, NDArray], found: Codes, facts: Mapping[str, Any], **details: Any
+    directory: RunDirectory,
+    arrays: Mapping[str, NDArray],
+    found: Codes,
+    spread: FloatArray | None,
+    facts: Mapping[str, Any],
+    **details: Any,
 ) -> None:
-    """Write modes, the codes of the shapes with their bounds, and facts. ``details`` are too long for the log."""
+    """Write modes, the codes of the shapes with their bounds, and facts. ``details`` are too long for the log.
+
+    Bounds also have room for soft fields, whose codes have a standard deviation ``spread`` (m,).
+    """
     given = directory.shapes.read()
     shapes, originals = given["vertices"], int(given["original"].max()) + 1
-    lower, upper = box_of(found.codes)
+    soft = np.empty((0, found.codes.shape[1])) if spread is None else DEVIATIONS * np.stack([-spread, spread])
+    lower, upper = box_of(np.concatenate([found.codes, soft]))
     coefficients = {"coefficients": found.codes[:originals], "mirrored_coefficients": found.codes[originals:]}
     every = {**arrays, **coefficients, "lower": lower, "upper": upper}
     directory.modes_by_strength.write(**every)

@@ -87,6 +87,15 @@ def test_places_of_one_name_are_told_apart() -> None:
     assert again == f"{outer} 2", "the same part cannot be told apart by its place"
 
 
+def test_a_relative_place_may_be_the_name_of_other_factors() -> None:
+    flat = body(3, 1, 0.5)
+    right, upper = ((2.9, 0.2, 0), (2.9, -0.2, 0)), ((2, 0.8, 0), (1.2, 0.95, 0))
+    alone = [named(flat, [near(flat, *place) * [0, 1, 0]]) for place in (*right, *upper)]
+    assert alone == [["right bends"]] * 2 + [["upper right bends"]] * 2
+    found = named(flat, [near(flat, *place) * [0, 1, 0] for place in (*right, *upper)])
+    assert found == ["upper right bends", "lower right bends", "upper right bends 2", "upper right bends 3"]
+
+
 def test_the_strongest_mode_says_how_and_all_modes_say_where() -> None:
     rest, angles = figure.rest(), list(figure.ANGLES)
     fields = figure.pose(1e-3 * np.eye(len(angles))) - rest.vertices
