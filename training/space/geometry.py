@@ -32,9 +32,8 @@ from shapespace.training.space.generalisation import (
     time_steps,
     vertex_distances,
 )
-from shapespace.training.space.modes import ModeCount, ModeError, coefficients, mode_count, worthwhile_with_soft
+from shapespace.training.space.modes import ModeCount, ModeError, coefficients, mode_count, pga, worthwhile_with_soft
 from shapespace.training.space.soft_fields import SoftFields, soft_fields
-from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
@@ -54,8 +53,6 @@ HOPEFUL = 1.2
 REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
-#: Modes in the comparison.
-DENSE = ModeSettings(sparsity=0, norm="vertices")
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -94,11 +91,11 @@ def choose_geometry(
 
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
-    number of modes, the smallest that one of them would have, and with few shapes also half as many. Soft fields are
-    among them where the shapes support fewer modes than pay. The cheapest
-    map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above exponentials. No map
-    remembers training shapes here. Means come from all shapes, and modes of exponentials are dense, because sparse
-    modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic from the mean.
+    number of modes, the smallest that one of them would have without soft fields, and with few shapes also half as
+    many. The cheapest map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above
+    exponentials. No map remembers training shapes here. Means come from all shapes, and modes of exponentials are
+    dense, because sparse modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic
+    from the mean.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last. ``among`` are the maps
     that "auto" compares, in the order of their cost. A single one is not compared.
@@ -143,9 +140,11 @@ def straight_count(
     Errors are measured on vertices at the mean, see `worthwhile_with_soft`.
     """
     if settings.count != "auto":
-        return ModeCount(max(1, min(settings.count, len(lines))))
+        count = max(1, min(settings.count, len(lines)))
+        return ModeCount(count, count)
     found = worthwhile_with_soft(lines.motions(shapes), lambda: soft_fields_of(lines, material), original_index)
-    return found if found.soft else ModeCount(min(found.count, len(lines)))
+    count = min(found.supported, len(lines))
+    return found if found.soft else ModeCount(count, count)
 
 
 def straight_lines(
@@ -202,20 +201,18 @@ class _Comparison:
             kind: straight_count(settings, each, self._shapes, self._original_index, self._material)
             for kind, each in lines.items()
         }
-        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind, each.soft) for kind, each in own.items()}
+        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
         asked = list(own.values())
         if "exponential" in self._among:
             with suppress(ModeError, NotPositiveDefiniteError):  # they have no mean, or reach too few shapes
                 at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-                bent = mode_count(settings, *at, self._own)
-                asked.append(bent)
-                maps["exponential"] = partial(self._on_exponentials, *at, bent.soft)
+                asked.append(mode_count(settings, *at, self._own))
+                maps["exponential"] = partial(self._on_exponentials, *at)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
         every = folds(int(self._own.max()) + 1)
-        # Without soft fields there are fewer modes than shapes.
-        supported = [int((~np.isin(self._own, index)).sum()) - 1 for index in every if not all(x.soft for x in asked)]
-        count = max(1, min(*(each.count for each in asked), *supported))
+        supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in every)
+        count = max(1, min(*(each.supported for each in asked), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
         folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
@@ -239,25 +236,16 @@ class _Comparison:
         share = soft.share if (soft := own[kind].soft) else 0.0
         return GeometryChoice(kind, 1, own[kind].count, count, held_out, errors, folded, share)
 
-    def _on_lines(
-        self, kind: StraightKind, soft: SoftFields | None, kept: IntArray, index: IntArray, count: int
-    ) -> FloatArray:
+    def _on_lines(self, kind: StraightKind, kept: IntArray, index: IntArray, count: int) -> FloatArray:
         """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
-        lines = StraightLines.of(kind, self._some, self._reference, kept, soft=soft)
+        lines = StraightLines.of(kind, self._some, self._reference, kept)
         return lines.first(count).nearest(self._some[index]).vertices
 
     def _on_exponentials(
-        self,
-        space: ShellSpace,
-        mean: FloatArray,
-        fields: FloatArray,
-        soft: SoftFields | None,
-        kept: IntArray,
-        index: IntArray,
-        count: int,
+        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, kept: IntArray, index: IntArray, count: int
     ) -> FloatArray:
         """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
-        modes = find_modes(DENSE, space, mean, fields[kept], count, soft=soft).vertices
+        modes = pga(space, mean, fields[kept], count, "vertices").vertices
         start, _ = coefficients(space, mean, fields[index], modes, "vertices")
         return nearest_codes(space, mean, modes, self._some[index], start, self._light).vertices
 

@@ -91,6 +91,7 @@ class ModeCount:
     """The number of modes, and the soft fields that some of them come from."""
 
     count: int
+    supported: int  # number without soft fields
     soft: SoftFields | None = None
 
 
@@ -111,11 +112,13 @@ def mode_count(
     if the fields can't be used.
     """
     if settings.count != "auto":
-        return ModeCount(max(1, min(settings.count, len(fields) - 1)))
+        count = max(1, min(settings.count, len(fields) - 1))
+        return ModeCount(count, count)
     problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
     root = np.sqrt(problem.areas)
     if settings.norm == "shell":  # the paper's
-        return ModeCount(worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index))
+        count = worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index)
+        return ModeCount(count, count)
     return worthwhile_with_soft(problem.D, lambda: soft_fields(space, mean), original_index, root)
 
 
@@ -137,17 +140,17 @@ def worthwhile_with_soft(
     left = left_of_held_out(rows @ rows.T, original_index)
     count, most = worthwhile(left, original_index), most_modes(n, original_index)
     if count < most or int(original_index.max()) + 1 < INNER_FOLDS:
-        return ModeCount(count)
+        return ModeCount(count, count)
     share = SOFT_SHARE * float(left[:, most].sum() / left[:, 0].sum())
     if share < NEGLIGIBLE:
-        return ModeCount(count)
+        return ModeCount(count, count)
     found = SoftFields(soft(), share)
     others = found.fields.reshape(len(found.fields), -1) * root
     every = np.concatenate([rows, found.scale(rows, others) * others])
     whose = np.concatenate([original_index, np.full(len(found.fields), NEVER_HELD_OUT)])
     left = left_of_held_out(every @ every.T, whose)[:n]
     more = worthwhile(left, original_index, len(every) - 1)
-    return ModeCount(more, found) if more > count else ModeCount(count)
+    return ModeCount(more, count, found) if more > count else ModeCount(count, count)
 
 
 def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: int | None = None) -> int:
