@@ -49,13 +49,15 @@ models](generalisation.md#stronger-simple-models). Empty cells: there are too fe
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Expect no details of single shapes.** From five shapes, training takes at most three modes.
+- **Look at the sliders.** {counts} Most of them are [soft modes](../explanation/choosing.md#few-shapes), along which
+  an elastic surface bends easily. They can fit an unseen shape, but none of your shapes shows them.
 
 ## How it was measured
 
 - Training shapes are drawn at random: {draws}. Figures are means over the draws.
 - Each draw chooses its [map](../explanation/choosing.md#map-from-codes-to-shapes) and its number of modes by itself
-  (see `runs/few-shapes.json`). The simple models have as many modes and the same coarse meshes.
+  (see `runs/few-shapes.json`). The simple models have the same coarse meshes and as many modes, but at most one less
+  than shapes: there are no more.
 - Exponentials are exact here. Networks add an error of their own, see [unseen shapes](served.md).
 - `python -m benchmarks.few_shapes --data FOLDER` measures and writes this page. {measured}
 """
@@ -170,12 +172,14 @@ def write_page() -> None:
         [name, *(cell(found[name, count]) if (name, count) in found else "" for count in counts)] for name in NAMES
     ]
     largest = [f"With {most} shapes, {name} has {cell(row)}." for (name, count), row in found.items() if count == most]
+    ten = [count for key, row in found.items() if key[1] == 10 for count in row["counts"]]
     draw_chart(found, pages.MEASUREMENTS / "few-shapes.svg")
     draws = ", ".join(f"{count} shapes {'once' if times == 1 else f'{times} times'}" for count, times in DRAWS.items())
     page = PAGE.format(
         finding=finding(found),
         table=table(("", *(f"{count} shapes" for count in counts)), cells),
         largest=" ".join(largest),
+        counts=f"From ten shapes, training takes {min(ten):.0f} to {max(ten):.0f} modes.",
         unseen=UNSEEN,
         draws=draws,
         measured=pages.measured_with(FIGURES),

@@ -42,7 +42,7 @@ data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; rel
 
 [modes]
 geometry = "auto"    # "exponential" bends; "vertices", "nric", "differential" are straight lines and fast; or "auto"
-# count = "{mode.count}"    # how many numbers describe a shape, at most {most}; "auto" stops when more help little
+# count = "{mode.count}"    # how many numbers describe a shape; a number that you choose is at most {most}
 # norm = "{mode.norm}"    # how errors of modes are measured; "shell", as in the paper, gives larger vertex errors
 
 [factors]
