@@ -115,11 +115,10 @@ def mode_count(
         count = max(1, min(settings.count, len(fields) - 1))
         return ModeCount(count, count)
     problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
-    root = np.sqrt(problem.areas)
     if settings.norm == "shell":  # the paper's
         count = worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index)
         return ModeCount(count, count)
-    return worthwhile_with_soft(problem.D, lambda: soft_fields(space, mean), original_index, root)
+    return worthwhile_with_soft(problem.D, lambda: soft_fields(space, mean), original_index, np.sqrt(problem.areas))
 
 
 def worthwhile_with_soft(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import eigsh
 
 from shapespace.arrays import FloatArray
@@ -21,8 +22,8 @@ from shapespace.shell.space import ShellSpace
 
 #: Number of soft fields.
 SOFT = 60
-#: Rigid motions, which cost nothing.
-RIGID = 6
+#: Rigid motions of each separate part cost nothing: eigenvalues up to this share of the largest one are theirs.
+RIGID, FREE = 6, 1e-9
 #: Shift of the eigenvalues, as a share of the energy's mean diagonal, so that the energy can be factorised.
 SHIFT = 1e-6
 #: Modes take this share of the variance that the shapes leave to soft fields, so that the data's modes come first.
@@ -52,10 +53,13 @@ def soft_fields(space: ShellSpace, mean: FloatArray) -> FloatArray:
     stiffness = sparse.csc_array(jacobian.T @ metric @ jacobian)
     areas = vertex_areas(mean, space.connectivity.faces)
     mass = np.repeat(areas / areas.mean(), 3)
-    count = min(RIGID + SOFT, len(mass) - 2)
+    edges = space.connectivity.edges
+    links = sparse.coo_array((np.ones(len(edges)), edges.T), (len(mean), len(mean)))
+    count = min(RIGID * connected_components(links, directed=False)[0] + SOFT, len(mass) - 2)
     shift = -SHIFT * float(stiffness.diagonal().mean())
     start = np.random.default_rng(0).standard_normal(len(mass))  # without it, each call has other signs
     values, vectors = eigsh(stiffness, count, sparse.diags_array(mass).tocsc(), sigma=shift, v0=start)
-    order = np.argsort(values)[RIGID:]
+    order = np.argsort(values)
+    order = order[values[order] > FREE * values.max()]
     fields: FloatArray = vectors[:, order].T / np.sqrt(values[order])[:, None]
     return fields.reshape(len(order), -1, 3)

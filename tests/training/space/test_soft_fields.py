@@ -55,6 +55,18 @@ def test_soft_fields_are_the_cheapest_directions(ellipsoid: TriangleMesh) -> Non
     assert stiffness(farther * wave) > 2 * costs[5]
 
 
+def test_parts_do_not_move_apart(ellipsoid: TriangleMesh) -> None:
+    """Each part moves at no cost. These motions are no soft fields, because they would hide all others."""
+    x, away = ellipsoid.vertices, ellipsoid.vertices + np.array([0, 5, 0])
+    faces = np.concatenate([ellipsoid.faces, ellipsoid.faces + len(x)])
+    two = TriangleMesh.from_arrays(np.concatenate([x, away]), faces)
+    fields = soft_fields(ShellSpace(two, Material()), two.vertices)
+    weights = np.repeat(vertex_areas(x, ellipsoid.faces), 3)
+    for part in np.split(fields, 2, axis=1):
+        flat = part.reshape(len(part), -1) * weights
+        assert np.abs(flat @ rigid_motions(x).T).max() < 1e-4 * np.abs(flat).max()
+
+
 def test_eight_poses_come_nearer_to_unseen_poses_with_soft_modes() -> None:
     rest, poses = figure.rest(), np.random.default_rng(0).uniform(-0.3, 0.3, (KNOWN + 4, len(figure.ANGLES)))
     known, unseen = np.split(figure.pose(poses), [KNOWN])
