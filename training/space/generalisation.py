@@ -73,7 +73,8 @@ class PrincipalComponents:
 
     def random(self, count: int, codes: int, rng: np.random.Generator) -> FloatArray:
         """Draw shapes uniformly in bounds around the first components' coefficients, wide as the bounds of a model."""
-        drawn = rng.uniform(*box_of(self.coefficients[:, :count]), (codes, count))
+        some = self.coefficients[:, :count]  # there may be fewer
+        drawn = rng.uniform(*box_of(some), (codes, some.shape[1]))
         return self.mean + (drawn @ self.axes[:count]).reshape(codes, *self.mean.shape)
 
 

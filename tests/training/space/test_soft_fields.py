@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import shapespace
 from shapespace.arrays import FloatArray
 from shapespace.mesh.rigid_motion import rigid_motions
 from shapespace.mesh.triangle_mesh import TriangleMesh, vertex_areas
 from shapespace.shell.energy import Material
 from shapespace.shell.space import ShellSpace
 from shapespace.training.collection.generators import figure
+from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import parse
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.generalisation import PrincipalComponents, vertex_distances
@@ -103,17 +105,22 @@ def test_modes_of_the_data_come_first(ellipsoid: TriangleMesh, waves: FloatArray
     assert np.linalg.norm(basis.T @ first) > 0.99 * np.linalg.norm(first)
 
 
-def test_bounds_have_room_for_unseen_shapes(ellipsoid: TriangleMesh, waves: FloatArray, tmp_path: Path) -> None:
+def test_a_model_of_few_shapes_has_room_for_unseen_shapes(
+    ellipsoid: TriangleMesh, waves: FloatArray, tmp_path: Path
+) -> None:
     data = tmp_path / "shapes.npz"
     np.savez(data, vertices=waves[:KNOWN], faces=ellipsoid.faces)
     text = (
         f'[collection]\ndata = "{data}"\n[modes]\ngeometry = "vertices"\n'
-        '[export]\nname = "waves"\ntitle = "Waves"\ndescription = "Waves."\nlicence = "MIT"\n'
+        '[export]\ndecoder = false\nname = "waves"\ntitle = "Waves"\ndescription = "Waves."\nlicence = "MIT"\n'
     )
     run = Run(tmp_path / "run", parse(text, "waves.toml"), text, tmp_path / "models")
-    execute(run, "factors")
-    found, lines = run.directory.modes.read(), run.collection.lines
-    codes = lines.project(waves[KNOWN:] / run.collection.scale)
-    inside = (codes > found["lower"]) & (codes < found["upper"])
-    assert len(lines) > KNOWN - 1
-    assert inside.mean() > 0.9
+    assert execute(run)
+    model, unseen = shapespace.load(run.bundle), waves[KNOWN:]
+    assert model.dimension > KNOWN - 1
+    codes = run.collection.lines.project(unseen / run.collection.scale)
+    assert ((codes > model.lower) & (codes < model.upper)).mean() > 0.9
+    errors = np.mean([model.encode(shape).distances.mean() for shape in unseen]) / ellipsoid.diagonal
+    components = PrincipalComponents.of(waves[:KNOWN], ellipsoid.vertices).nearest(unseen, KNOWN - 1)
+    assert errors < 0.95 * vertex_distances(components, unseen, ellipsoid.diagonal).mean()
+    assert "as far as the shapes allow" in write_report(run.directory).read_text(encoding="utf-8")
