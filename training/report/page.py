@@ -111,7 +111,7 @@ def page(record: Record) -> str:
         served=bool(record.seconds.get("export")),
         accuracy=accuracy_cards(record, close or None),
         qualities=_qualities(record),
-        geometry=_geometry(record.geometry),
+        geometry=" ".join(filter(None, (_geometry(record.geometry), _soft(record.decomposition)))),
         stages=list(STAGES),
         pictures=studio is not None,
         shapes=list(shape_pictures(record, close)) if close else [],
@@ -174,6 +174,16 @@ def _geometry(choice: dict[str, Any]) -> str:
     return (
         f"{found}, beside {beside}. A cheaper map is taken if its error is at most 2 % above the best "
         "straight line, and at most 5 % above exponentials. The errors below are of other left-out shapes."
+    )
+
+
+def _soft(found: dict[str, Any]) -> str:
+    """Return a sentence on soft modes; empty where there are none."""
+    if not found.get("soft_share"):
+        return ""
+    return (
+        "Your shapes show fewer directions than unseen shapes need. So some coordinates are soft: along them an "
+        "elastic surface bends easily."
     )
 
 

@@ -62,6 +62,7 @@ def decompose(run: Run) -> None:
         "pga_explained": dense.explained,
         "linearised_logarithms": len(found.fallbacks),
         "asked": count if settings.count == "auto" else settings.count,
+        "soft_share": own.soft.share if own.soft else 0.0,
         "log_steps": steps,
         "exponential_steps": shooting,
         "steps": list(found.steps),
@@ -93,6 +94,7 @@ def _straighten(run: Run) -> None:
         "pga_explained": explained,
         "linearised_logarithms": 0,
         "asked": len(lines) if run.config.modes.count == "auto" else run.config.modes.count,
+        "soft_share": chosen.soft_share,
         "log_steps": 1,
         "steps": [1] * len(shapes),
     }
