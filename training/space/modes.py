@@ -129,9 +129,9 @@ def worthwhile_with_soft(
 ) -> ModeCount:
     """Return the number of modes that pay for motions (n, 3V) of vertices, from their mean to shapes.
 
-    Where the shapes support fewer modes than pay, there are further modes from ``soft`` fields (p, V, 3). Their
-    variance is `SOFT_SHARE` of what held-out shapes have outside the span of the other shapes. ``root`` are square
-    roots (3V,) of weights.
+    Where more modes pay than n shapes have, there are further modes from ``soft`` fields (p, V, 3). Their variance is
+    `SOFT_SHARE` of what held-out shapes have outside the span of the other shapes. ``root`` are square roots (3V,) of
+    weights.
     """
     rows = rows * root
     n = len(rows)
@@ -149,7 +149,8 @@ def worthwhile_with_soft(
     whose = np.concatenate([original_index, np.full(len(found.fields), NEVER_HELD_OUT)])
     left = left_of_held_out(every @ every.T, whose)[:n]
     more = worthwhile(left, original_index, len(every) - 1)
-    return ModeCount(more, count, found) if more > count else ModeCount(count, count)
+    # As long as there are modes of the data, these are better.
+    return ModeCount(more, count, found) if more >= n else ModeCount(count, count)
 
 
 def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: int | None = None) -> int:
