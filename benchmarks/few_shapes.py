@@ -49,8 +49,8 @@ models](generalisation.md#stronger-simple-models). Empty cells: there are too fe
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Look at the sliders.** {counts} Most of them are [soft modes](../explanation/choosing.md#few-shapes), along which
-  an elastic surface bends easily. They can fit an unseen shape, but none of your shapes shows them.
+- **Look at the sliders.** {counts} Those beyond nine are [soft modes](../explanation/choosing.md#few-shapes), along
+  which an elastic surface bends easily. They can fit an unseen shape, but none of your shapes shows them.{rises}
 
 ## How it was measured
 
@@ -159,6 +159,18 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
     return said
 
 
+def rises(found: dict[tuple[str, int], dict[str, Any]]) -> Iterable[str]:
+    """Yield a sentence for each collection and number of shapes with a larger error than half as many shapes have."""
+    for (name, count), row in found.items():
+        fewer = found.get((name, count // 2))
+        if fewer and row["modes"] > fewer["modes"] and max(row["counts"]) < count:
+            most, before = max(row["counts"]), max(fewer["counts"])
+            yield (
+                f"\n- **More shapes may have fewer modes.** With {count} shapes, {name} has {most:.0f} modes, none of "
+                f"them soft. With {count // 2} it has up to {before:.0f}, and a smaller error."
+            )
+
+
 def write_page() -> None:
     """Write the page and its chart from the stored figures."""
     found = means(pages.read_figures(FIGURES))
@@ -179,6 +191,7 @@ def write_page() -> None:
         finding=finding(found),
         table=table(("", *(f"{count} shapes" for count in counts)), cells),
         largest=" ".join(largest),
+        rises="".join(rises(found)),
         counts=f"From ten shapes, training takes {min(ten):.0f} to {max(ten):.0f} modes.",
         unseen=UNSEEN,
         draws=draws,
