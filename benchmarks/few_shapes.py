@@ -127,7 +127,7 @@ def draw_chart(found: dict[tuple[str, int], dict[str, Any]], path: Path) -> None
         figure.supxlabel("training shapes", fontsize=9)
         figure.supylabel("error, % of the diagonal", fontsize=9)
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
         figure.savefig(
             path, format="svg", facecolor="white", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
         )
