@@ -251,9 +251,8 @@ class _Comparison:
 
     def _lines(self) -> dict[StraightKind, StraightLines]:
         found: dict[StraightKind, StraightLines] = {}
-        kinds: tuple[StraightKind, ...] = ("vertices", "differential", "nric")
-        for kind in kinds:
-            if kind not in self._among:
+        for kind in self._among:
+            if kind == "exponential":
                 continue
             try:
                 lines = StraightLines.of(kind, self._shapes, self._reference)

@@ -91,7 +91,8 @@ def find_modes(
     if the count or the sparsity is not possible.
     """
     if soft:
-        n, original_index = len(fields), np.arange(len(fields)) if original_index is None else original_index
+        n = len(fields)
+        original_index = np.arange(n) if original_index is None else original_index
         problem = ModeProblem(space, mean, np.concatenate([fields, soft.fields]), 1, "vertices")
         rows = problem.D * np.sqrt(problem.areas)
         every = np.concatenate([fields, soft.scale(rows[:n], rows[n:]) * soft.fields])
