@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.arrays import FloatArray
 from shapespace.coordinates.frame_integration import FrameIntegration
-from shapespace.mesh.rigid_motion import align
+from shapespace.mesh.rigid_motion import align, without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh, face_areas, face_normals
 
 #: Coordinates of a face: a rotation vector, and the entries of a symmetric matrix on and above the diagonal.
@@ -73,6 +73,21 @@ class FaceCoordinates:
             stretches = right.swapaxes(1, 2) @ (values[:, :, None] * right) - np.eye(3)
             rows.append(np.concatenate([rotations, stretches[:, *UPPER] * FACTORS], axis=1).ravel())
         return np.stack(rows)
+
+    def along(self, fields: FloatArray) -> FloatArray:
+        """Return derivatives (n, 9F) of the base's coordinates along vertex fields (n, V, 3)."""
+        moved = without_rigid_motion(fields, self.base.vertices)[:, self.base.faces]
+        corners, normals = self.base.vertices[self.base.faces], face_normals(self.base.vertices, self.base.faces)
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        da, db = moved[:, :, 1] - moved[:, :, 0], moved[:, :, 2] - moved[:, :, 0]
+        turned = (np.cross(da, b) + np.cross(a, db)) / np.linalg.norm(np.cross(a, b), axis=1)[:, None]
+        turned -= (turned * normals).sum(axis=2, keepdims=True) * normals
+        maps = np.stack([da, db, turned], axis=3) @ self._inverse
+        # The base is not turned or stretched, so these are the parts of the map itself.
+        stretches, spins = (maps + maps.swapaxes(2, 3)) / 2, (maps - maps.swapaxes(2, 3)) / 2
+        rotations = np.stack([spins[..., 2, 1], spins[..., 0, 2], spins[..., 1, 0]], axis=2)
+        found = np.concatenate([rotations, stretches[..., *UPPER] * FACTORS], axis=2)
+        return found.reshape(len(fields), -1)
 
     def _parts(self, row: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return rotation vectors (…, F, 3) and stretches (…, F, 3, 3) of coordinates (…, 9F)."""

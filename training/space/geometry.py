@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -32,9 +32,18 @@ from shapespace.training.space.generalisation import (
     time_steps,
     vertex_distances,
 )
-from shapespace.training.space.modes import ModeCount, ModeError, coefficients, mode_count, pga, worthwhile_with_soft
-from shapespace.training.space.soft_fields import SoftFields, soft_fields
-from shapespace.training.space.straight_lines import StraightKind, StraightLines
+from shapespace.training.space.local_fields import LocalVariation, local_fields, scale_of
+from shapespace.training.space.modes import (
+    ModeCount,
+    ModeError,
+    coefficients,
+    left_of_held_out,
+    mode_count,
+    pga,
+    unseen_share,
+    worthwhile_with_local,
+)
+from shapespace.training.space.straight_lines import StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
@@ -53,6 +62,8 @@ HOPEFUL = 1.2
 REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
+#: Shares of the variance that local fields may add to the modes of the chosen map, the smallest first.
+LOCAL_SHARES = (0.0, 0.03, 0.1, 0.3)
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -70,12 +81,19 @@ class GeometryChoice:
     # mean distance of each map from these shapes, as a share of the diagonal
     errors: dict[Kind, float] = field(default_factory=dict)
     folded: float = 0.0  # share of random shapes that fold on straight lines of vertices
-    soft_share: float = 0.0  # variance that soft fields add to straight lines, as a share of the shapes' variance
+    local_share: float = 0.0  # variance that local fields add to the modes, as a share of the shapes' variance
+    unseen_share: float = 0.0  # variance of held-out shapes outside the span of the others, as a share of theirs
+    local_gain: float = 0.0  # share by which local fields lower the error of shapes in the comparison
 
     @property
     def light_steps(self) -> int:
         """K where spaces are compared."""
         return min(LIGHT_STEPS, self.steps)
+
+    @property
+    def local(self) -> LocalVariation | None:
+        """The local variation of the modes, if there is any."""
+        return LocalVariation(self.local_share, self.unseen_share) if self.local_share else None
 
 
 def choose_geometry(
@@ -86,16 +104,21 @@ def choose_geometry(
     original_index: IntArray | None = None,
     first_step: FirstStep = "centred",
     among: Sequence[Kind] = COST,
+    *,
+    vary: bool = True,
 ) -> GeometryChoice:
     """Choose the map from codes to shapes (n, V, 3), the number of modes and K.
 
     ``modes.geometry = "auto"`` compares four maps on shapes that are held out of the modes in inner folds: straight
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
-    number of modes, the smallest that one of them would have without soft fields, and with few shapes also half as
+    number of modes, the smallest that one of them would have without local fields, and with few shapes also half as
     many. The cheapest map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above
     exponentials. No map remembers training shapes here. Means come from all shapes, and modes of exponentials are
     dense, because sparse modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic
     from the mean.
+
+    If modes may ``vary``, the same folds then choose how much of the variance of its modes comes from local fields,
+    unless the number of modes needs them anyway.
 
     ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last. ``among`` are the maps
     that "auto" compares, in the order of their cost. A single one is not compared.
@@ -106,16 +129,11 @@ def choose_geometry(
         return GeometryChoice("exponential", steps)
     if settings.geometry != "auto":
         among = (settings.geometry,)
-    kind, *others = among
     few = original_index.max() + 1 < FOLDS  # too few to compare exponentials
-    if kind == "exponential" or (few and "exponential" in others):
+    if "exponential" in among and (few or (len(among) == 1 and not vary)):
         return GeometryChoice("exponential", _many(settings, first_step))
-    if not others:
-        lines = StraightLines.of(kind, shapes, reference)
-        lines.require_mean(reference)
-        own = straight_count(settings, lines, shapes, original_index, material)
-        return GeometryChoice(kind, 1, own.count, soft_share=own.soft.share if own.soft else 0.0)
-    return _Comparison(settings, reference, shapes, material, original_index, first_step, among).choice()
+    comparison = _Comparison(settings, reference, shapes, material, original_index, first_step, among, vary)
+    return comparison.choice() if len(among) > 1 else comparison.of_one(among[0])
 
 
 def hopeful(kind: Kind, errors: Mapping[Kind, float]) -> tuple[Kind, ...]:
@@ -133,45 +151,62 @@ def _many(settings: ModeSettings, first_step: FirstStep) -> int:
 
 
 def straight_count(
-    settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray, material: Material
+    settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray
 ) -> ModeCount:
     """Return the number of modes of straight lines, as configured or by cross-validation.
 
-    Errors are measured on vertices at the mean, see `worthwhile_with_soft`.
+    Errors are measured on vertices at the mean, see `worthwhile_with_local`.
     """
     if settings.count != "auto":
         count = max(1, min(settings.count, len(lines)))
         return ModeCount(count, count)
-    found = worthwhile_with_soft(lines.motions(shapes), lambda: soft_fields_of(lines, material), original_index)
+    motions = lines.motions(shapes)
+
+    def local() -> FloatArray:
+        return local_fields(lines.reference, motions.reshape(len(shapes), -1, 3))
+
+    found = worthwhile_with_local(motions, local, original_index)
     count = min(found.supported, len(lines))
-    return found if found.soft else ModeCount(count, count)
+    return found if found.local else ModeCount(count, count)
 
 
 def straight_lines(
-    choice: GeometryChoice,
-    shapes: FloatArray,
-    reference: TriangleMesh,
-    material: Material,
-    vertex_counts: FloatArray | None = None,
+    choice: GeometryChoice, shapes: FloatArray, reference: TriangleMesh, vertex_counts: FloatArray | None = None
 ) -> StraightLines:
     """Return the chosen straight lines of shapes (n, V, 3), along all their modes. ``vertex_counts`` as for lines."""
     if choice.kind == "exponential":
         raise ValueError("exponentials are no straight lines")
-    lines = StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts)
-    if not choice.soft_share:
-        return lines
-    soft = SoftFields(soft_fields_of(lines, material), choice.soft_share)
-    return StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts, soft=soft)
+    share = choice.local_share
+    return StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts, norm="vertices", share=share)
 
 
-def soft_fields_of(lines: StraightLines, material: Material) -> FloatArray:
-    """Return the soft fields (p, V, 3) at the mean of straight lines."""
-    return soft_fields(ShellSpace(lines.reference, material), lines.reference.vertices)
+#: Map from indices of the shapes that modes are found from, indices of unseen shapes, a number of modes, and the share
+#: of local fields with these fields (n, k, V, 3), to the nearest shapes.
+_Nearest = Callable[[IntArray, IntArray, int, float, FloatArray | None], FloatArray]
 
 
-#: Map from indices of the shapes that modes are found from, indices of unseen shapes, and a number of modes, to the
-#: nearest shapes (k, V, 3).
-_Nearest = Callable[[IntArray, IntArray, int], FloatArray]
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """A map of all shapes, of which modes are found without some of them."""
+
+    kind: Kind
+    nearest: _Nearest
+    own: ModeCount
+    mean: TriangleMesh
+    rows: FloatArray  # (n, 3V) motions of vertices to the shapes that are compared
+    straight: StraightLines | None = None
+
+    @cached_property
+    def local(self) -> FloatArray:
+        """Local fields (n, k, V, 3) of the shapes that are compared."""
+        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+
+    @property
+    def lines(self) -> StraightLines:
+        """The straight lines."""
+        if self.straight is None:
+            raise ValueError("exponentials are no straight lines")
+        return self.straight
 
 
 class _Comparison:
@@ -186,9 +221,10 @@ class _Comparison:
         original_index: IntArray,
         first_step: FirstStep,
         among: Sequence[Kind],
+        vary: bool,
     ) -> None:
         self._settings, self._reference, self._shapes, self._material = settings, reference, shapes, material
-        self._original_index, self._among = original_index, among
+        self._original_index, self._among, self._vary = original_index, among, vary
         used = original_index % -(-(original_index.max() + 1) // CHOICE_SHAPES) == 0
         self._some, self._own = shapes[used], np.unique(original_index[used], return_inverse=True)[1]
         self._steps, self._first_step = _many(settings, first_step), first_step
@@ -196,71 +232,132 @@ class _Comparison:
 
     def choice(self) -> GeometryChoice:
         """Compare the maps fold by fold, until the choice is certain."""
-        settings, lines = self._settings, self._lines()
-        own = {
-            kind: straight_count(settings, each, self._shapes, self._original_index, self._material)
-            for kind, each in lines.items()
-        }
-        maps: dict[Kind, _Nearest] = {kind: partial(self._on_lines, kind) for kind in lines}
-        asked = list(own.values())
-        if "exponential" in self._among:
-            with suppress(ModeError, NotPositiveDefiniteError):  # they have no mean, or reach too few shapes
-                at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-                asked.append(mode_count(settings, *at, self._own))
-                maps["exponential"] = partial(self._on_exponentials, *at)
+        maps: dict[Kind, _Map] = {}
+        for kind in self._among:
+            with suppress(ModeError, NotPositiveDefiniteError):
+                maps[kind] = self._map(kind)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
         every = folds(int(self._own.max()) + 1)
         supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in every)
-        count = max(1, min(*(each.supported for each in asked), *supported))
+        count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
-        folded = self._folded(lines["vertices"].first(min(count, FOLDED_MODES))) if "vertices" in lines else 0.0
+        folded = 0.0
+        if vertices := maps.get("vertices"):
+            folded = self._folded(vertices.lines.first(min(count, FOLDED_MODES)))
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
         for index in every:
-            kept, held_out = np.flatnonzero(~np.isin(self._own, index)), held_out + len(index)
+            held_out += len(index)
             for each in list(away):
                 with suppress(ModeError, NotPositiveDefiniteError):
-                    given = self._some[index]
-                    near = [maps[each](kept, index, some) for some in counts]
-                    distances = [vertex_distances(x, given, self._reference.diagonal).mean(axis=1) for x in near]
-                    away[each] = np.concatenate([away[each], np.mean(distances, axis=0)])
+                    found = [self._distances(maps[each], index, some) for some in counts]
+                    away[each] = np.concatenate([away[each], np.mean(found, axis=0)])
                     continue
                 del away[each]
             errors = {each: float(distances.mean()) for each, distances in away.items()}
             kind = cheapest(errors, folded)
             if held_out >= ENOUGH and certain(away, kind):
                 break
-        if kind == "exponential":
-            return GeometryChoice(kind, self._steps, None, count, held_out, errors, folded)
-        share = soft.share if (soft := own[kind].soft) else 0.0
-        return GeometryChoice(kind, 1, own[kind].count, count, held_out, errors, folded, share)
+        if kind not in maps:
+            return GeometryChoice(kind, self._steps)
+        return replace(self._chosen(maps[kind]), compared=count, held_out=held_out, errors=errors, folded=folded)
 
-    def _on_lines(self, kind: StraightKind, kept: IntArray, index: IntArray, count: int) -> FloatArray:
+    def of_one(self, kind: Kind) -> GeometryChoice:
+        """Return the choice of a map that is not compared with others.
+
+        Raises ModeError or NotPositiveDefiniteError if straight lines have no mean.
+        """
+        try:
+            return self._chosen(self._map(kind))
+        except (ModeError, NotPositiveDefiniteError):
+            if kind == "exponential":  # the stages that need a mean report it
+                return GeometryChoice(kind, self._steps)
+            raise
+
+    def _map(self, kind: Kind) -> _Map:
+        """Return a map of all shapes. Raises ModeError or NotPositiveDefiniteError if it has no mean."""
+        if kind == "exponential":
+            # They must reach enough shapes.
+            at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
+            count = mode_count(self._settings, *at, self._own)
+            centre = self._reference.with_vertices(at[1])
+            return _Map(kind, partial(self._on_exponentials, *at), count, centre, at[2].reshape(len(self._some), -1))
+        lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
+        lines.require_mean(self._reference)
+        offsets = lines.offsets(self._some)
+        count = straight_count(self._settings, lines, self._shapes, self._original_index)
+        rows = lines.moved(offsets).reshape(len(offsets), -1)
+        return _Map(kind, partial(self._on_lines, lines, offsets), count, lines.reference, rows, lines)
+
+    def _chosen(self, chosen: _Map) -> GeometryChoice:
+        """Return the choice of a map, with the share of local fields in its modes."""
+        own = chosen.own
+        steps, count = (self._steps, None) if chosen.kind == "exponential" else (1, own.count)
+        if own.local:
+            return GeometryChoice(chosen.kind, steps, count, local_share=own.local.share, unseen_share=own.local.unseen)
+        share, gain = self._local_share(chosen) if self._vary and self._own.max() + 1 >= FOLDS else (0.0, 0.0)
+        if not share:
+            return GeometryChoice(chosen.kind, steps, count)
+        unseen = unseen_share(left_of_held_out(chosen.rows @ chosen.rows.T, self._own), self._own)
+        return GeometryChoice(chosen.kind, steps, count, local_share=share, unseen_share=unseen, local_gain=gain)
+
+    def _local_share(self, chosen: _Map) -> tuple[float, float]:
+        """Return the share of local fields with the least error on held-out shapes, and by how much it lowers it."""
+        away = {share: np.empty(0) for share in LOCAL_SHARES}
+        trying, best = list(LOCAL_SHARES), 0.0
+        for index in folds(int(self._own.max()) + 1):
+            kept = int(self._own.max()) + 1 - len(index)
+            for share in trying:
+                found = self._distances(chosen, index, max(1, min(chosen.own.count, kept - 1)), share)
+                away[share] = np.concatenate([away[share], found])
+            best = min(trying, key=lambda share: away[share].mean())
+            if len(away[best]) >= ENOUGH:
+                trying = [each for each in trying if each == best or not _certainly_positive(away[each] - away[best])]
+            if len(trying) == 1:
+                break
+        return best, 1 - float(away[best][: len(away[0])].mean() / away[0][: len(away[best])].mean())
+
+    def _distances(self, chosen: _Map, index: IntArray, count: int, share: float = 0.0) -> FloatArray:
+        """Return distances (k,) of shapes that are held out from the nearest shapes of a map."""
+        held = np.isin(self._own, index)
+        given = self._some[index]
+        kept = np.flatnonzero(~held)
+        near = chosen.nearest(kept, index, count, share, chosen.local[kept] if share else None)
+        return vertex_distances(near, given, self._reference.diagonal).mean(axis=1)
+
+    def _on_lines(
+        self,
+        lines: StraightLines,
+        offsets: FloatArray,
+        kept: IntArray,
+        index: IntArray,
+        count: int,
+        share: float,
+        local: FloatArray | None,
+    ) -> FloatArray:
         """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
-        lines = StraightLines.of(kind, self._some, self._reference, kept)
-        return lines.first(count).nearest(self._some[index]).vertices
+        return lines.along(offsets[kept], share, local).first(count).nearest(self._some[index]).vertices
 
     def _on_exponentials(
-        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, kept: IntArray, index: IntArray, count: int
+        self,
+        space: ShellSpace,
+        mean: FloatArray,
+        fields: FloatArray,
+        kept: IntArray,
+        index: IntArray,
+        count: int,
+        share: float,
+        local: FloatArray | None,
     ) -> FloatArray:
         """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
-        modes = pga(space, mean, fields[kept], count, "vertices").vertices
+        some = fields[kept]
+        if local is not None:
+            local = scale_of(local, some, share) * local
+            some = np.concatenate([some, local.reshape(-1, *mean.shape)])
+        modes = pga(space, mean, some, count, "vertices").vertices
         start, _ = coefficients(space, mean, fields[index], modes, "vertices")
         return nearest_codes(space, mean, modes, self._some[index], start, self._light).vertices
-
-    def _lines(self) -> dict[StraightKind, StraightLines]:
-        found: dict[StraightKind, StraightLines] = {}
-        for kind in self._among:
-            if kind == "exponential":
-                continue
-            try:
-                lines = StraightLines.of(kind, self._shapes, self._reference)
-                lines.require_mean(self._reference)
-            except (ModeError, NotPositiveDefiniteError):
-                continue
-            found[kind] = lines
-        return found
 
     def _folded(self, lines: StraightLines) -> float:
         """Return the share of random shapes that fold where no training shape has a crease."""
@@ -306,6 +403,10 @@ def certain(errors: dict[Kind, FloatArray], kind: Kind) -> bool:
             cheaper = COST.index(kind) < COST.index(other)
             margin = _margin(kind, other)
             gaps = margin * theirs - errors[kind] if cheaper else theirs - margin * errors[kind]
-            if gaps.mean() < CERTAIN * gaps.std() / np.sqrt(len(gaps)):
+            if not _certainly_positive(gaps):
                 return False
     return True
+
+
+def _certainly_positive(gaps: FloatArray) -> bool:
+    return bool(gaps.mean() >= CERTAIN * gaps.std() / np.sqrt(len(gaps)))

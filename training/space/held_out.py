@@ -29,6 +29,7 @@ from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import Codes, ShapeMap, exponential_map, nearest_codes
 from shapespace.training.space.generalisation import PrincipalComponents, space_of, vertex_distances
 from shapespace.training.space.geometry import COST, GeometryChoice, Kind, choose_geometry, straight_lines
+from shapespace.training.space.local_fields import LocalVariation
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
@@ -89,31 +90,34 @@ def held_out(
     *,
     remember: bool = True,
     among: Sequence[Kind] = COST,
+    vary: bool = True,
 ) -> HeldOut:
     """Find mean and modes without some shapes, and approximate these shapes.
 
     Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
     shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
     number of the other shapes. The map from codes to shapes is as configured for the other shapes; "auto" chooses
-    ``among`` some maps. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`; K stands for
-    exponentials. The map may ``remember`` the shapes that it was found from, as bundles do. Raises ModeError if the
-    other shapes have no mean, or no modes.
+    ``among`` some maps, and whether modes ``vary`` locally. ``steps`` is K, by default as configured for these, and at
+    most `LIGHT_STEPS`; K stands for exponentials. The map may ``remember`` the shapes that it was found from, as
+    bundles do. Raises ModeError if the other shapes have no mean, or no modes.
     """
     original = np.arange(len(shapes)) if original is None else original
     known = np.flatnonzero(~np.isin(original, index))
     kept, unseen = shapes[known], shapes[index]
     original_index = np.unique(original[known], return_inverse=True)[1]
     if steps is None:
-        choice = choose_geometry(settings, reference, kept, material, original_index, first_step, among)
+        choice = choose_geometry(settings, reference, kept, material, original_index, first_step, among, vary=vary)
     else:
         choice = GeometryChoice("exponential", steps)
     space: _Exponentials | StraightLines
     if choice.kind == "exponential":
         steps = choice.light_steps
-        space = _Exponentials(settings, reference, kept, unseen, original_index, material, steps, first_step)
+        space = _Exponentials(
+            settings, reference, kept, unseen, original_index, material, steps, first_step, choice.local
+        )
         count = space.count if choice.count is None else choice.count
     else:
-        space = straight_lines(choice, kept, reference, material)
+        space = straight_lines(choice, kept, reference)
         count = choice.count or len(space)
     workers = -1 if choice.kind == "exponential" else 1  # shapes of straight lines take less time than processes
     rivals = simple_models(reference, kept, original[known] == known)
@@ -185,6 +189,7 @@ class _Exponentials:
         material: Material,
         steps: int,
         first_step: FirstStep,
+        local: LocalVariation | None,
     ) -> None:
         self._settings, self._original_index, self._steps = settings, original_index, steps
         self._space, self._mean, self._fields = space_of(reference, kept, material, steps, first_step)
@@ -192,7 +197,7 @@ class _Exponentials:
         # shape.
         self._towards = logarithms(self._space, self._mean, unseen, steps).fields
         own = mode_count(settings, self._space, self._mean, self._fields, original_index)
-        self.count, self._soft = own.count, own.soft  # as configured
+        self.count, self._local = own.count, own.local or local  # as configured
 
     def __len__(self) -> int:
         """Largest number of modes."""
@@ -201,8 +206,8 @@ class _Exponentials:
     def first(self, count: int) -> _Exponentials:
         """Return the exponentials along this number of modes."""
         found = copy(self)
-        soft = self._soft
-        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index, soft)
+        share = self._local.share if self._local else 0.0
+        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index, share)
         found._modes, found._codes = modes.vertices, modes.coefficients
         found.shape = exponential_map(self._space, self._mean, found._modes, self._steps)
         return found

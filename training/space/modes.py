@@ -33,7 +33,7 @@ from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
 from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.shell.space import ShellPoint, ShellSpace
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.soft_fields import SOFT_SHARE, SoftFields, soft_fields
+from shapespace.training.space.local_fields import LOCAL_SHARE, LocalVariation, local_fields, scale_of
 
 #: The norm of the misfit between modes and logarithms.
 Norm = Literal["mixed", "vertices", "shell"]
@@ -47,8 +47,6 @@ LOCALISED_PART = 0.95
 INNER_FOLDS = 5
 #: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
 WORTH = 0.005
-#: Index of the original of a field that is never held out.
-NEVER_HELD_OUT = -1
 
 
 class ModeError(ValueError):
@@ -69,7 +67,7 @@ class Modes:
     explained: float  # share of ``Σ ‖v^i‖²`` that the projections keep
     converged: bool = True  # whether the iteration converged
     sparsity: float = 0.0  # λ, see ``spga``
-    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by soft fields, if there are any
+    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by local fields, if there are any
     # one row for each iteration of the sparse analysis: ``iteration, objective, misfit, penalty`` (objective = misfit +
     # penalty, as shares of ``Σ ‖v^i‖²``) and ``support``, the mean of ``localisation``
     history: list[dict[str, float]] = field(default_factory=list, repr=False)
@@ -88,11 +86,11 @@ def pga(space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, nor
 
 @dataclass(frozen=True, eq=False)
 class ModeCount:
-    """The number of modes, and the soft fields that some of them come from."""
+    """The number of modes, and the local variation that some of them come from."""
 
     count: int
-    supported: int  # number without soft fields
-    soft: SoftFields | None = None
+    supported: int  # number without local variation
+    local: LocalVariation | None = None
 
 
 def mode_count(
@@ -118,20 +116,24 @@ def mode_count(
     if settings.norm == "shell":  # the paper's
         count = worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index)
         return ModeCount(count, count)
-    return worthwhile_with_soft(problem.D, lambda: soft_fields(space, mean), original_index, np.sqrt(problem.areas))
+
+    def local() -> FloatArray:
+        return local_fields(space.reference.with_vertices(mean), fields)
+
+    return worthwhile_with_local(problem.D, local, original_index, np.sqrt(problem.areas))
 
 
-def worthwhile_with_soft(
+def worthwhile_with_local(
     rows: FloatArray,
-    soft: Callable[[], FloatArray],
+    local: Callable[[], FloatArray],
     original_index: IntArray | None = None,
     root: FloatArray | float = 1.0,
 ) -> ModeCount:
     """Return the number of modes that pay for motions (n, 3V) of vertices, from their mean to shapes.
 
-    Where more modes pay than n shapes have, there are further modes from ``soft`` fields (p, V, 3). Their variance is
-    `SOFT_SHARE` of what held-out shapes have outside the span of the other shapes. ``root`` are square roots (3V,) of
-    weights.
+    Where more modes pay than n shapes have, there are further modes from ``local`` fields (n, k, V, 3). Their variance
+    is `LOCAL_SHARE` of what held-out shapes have outside the span of the other shapes. ``root`` are square roots (3V,)
+    of weights.
     """
     rows = rows * root
     n = len(rows)
@@ -140,17 +142,27 @@ def worthwhile_with_soft(
     count, most = worthwhile(left, original_index), most_modes(n, original_index)
     if count < most or int(original_index.max()) + 1 < INNER_FOLDS:
         return ModeCount(count, count)
-    share = SOFT_SHARE * float(left[:, most].sum() / left[:, 0].sum())
+    unseen = unseen_share(left, original_index)
+    share = LOCAL_SHARE * unseen
     if share < NEGLIGIBLE:
         return ModeCount(count, count)
-    found = SoftFields(soft(), share)
-    others = found.fields.reshape(len(found.fields), -1) * root
-    every = np.concatenate([rows, found.scale(rows, others) * others])
-    whose = np.concatenate([original_index, np.full(len(found.fields), NEVER_HELD_OUT)])
-    left = left_of_held_out(every @ every.T, whose)[:n]
+    others = local()
+    flat = others.reshape(-1, rows.shape[1]) * root
+    every = np.concatenate([rows, scale_of(flat, rows, share) * flat])
+    left = left_of_held_out(every @ every.T, with_local(original_index, others))[:n]
     more = worthwhile(left, original_index, len(every) - 1)
     # As long as there are modes of the data, these are better.
-    return ModeCount(more, count, found) if more >= n else ModeCount(count, count)
+    return ModeCount(more, count, LocalVariation(share, unseen)) if more >= n else ModeCount(count, count)
+
+
+def unseen_share(left: FloatArray, original_index: IntArray) -> float:
+    """Return the share of the variance that held-out shapes have outside the span of the others, from square errors."""
+    return float(left[:, most_modes(len(left), original_index)].sum() / left[:, 0].sum())
+
+
+def with_local(original_index: IntArray, local: FloatArray) -> IntArray:
+    """Return the indices of originals (n + nk,) of shapes and of their local fields (n, k, V, 3), see `inner_folds`."""
+    return np.concatenate([original_index, ~np.repeat(original_index, local.shape[1])])
 
 
 def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: int | None = None) -> int:
@@ -167,13 +179,12 @@ def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: i
 def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -> FloatArray:
     """Return square errors (n, n) of held-out vectors for 0, 1, 2 … principal modes of the other vectors.
 
-    ``gram`` (n, n) has the inner products of the vectors. Rows of vectors that are never held out are 0.
+    ``gram`` (n, n) has the inner products of the vectors. Rows of local fields are 0.
     """
     n = len(gram)
     original_index = np.arange(n) if original_index is None else original_index
     left = np.zeros((n, n))
-    for held in map(np.flatnonzero, inner_folds(original_index)):
-        kept = np.delete(np.arange(n), held)
+    for held, kept in inner_folds(original_index):
         values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
         some = np.flatnonzero(values > NEGLIGIBLE * gram.trace())[::-1]
         along = np.zeros((len(held), n))
@@ -182,11 +193,15 @@ def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -
     return left
 
 
-def inner_folds(original_index: IntArray) -> list[NDArray[np.bool_]]:
-    """Return masks (n,) of the fields that are held out together."""
+def inner_folds(original_index: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Return the indices of the shapes that are held out together, and of the fields that are kept, for each fold.
+
+    ``original_index`` (n,) is the index i of each shape's original, or ``~i`` for a local field of a shape. Local
+    fields of the shapes that are held out are neither held out nor kept.
+    """
     parts = min(INNER_FOLDS, int(original_index.max()) + 1)
-    own = original_index != NEVER_HELD_OUT
-    return [own & (original_index % parts == part) for part in range(parts)]
+    fold, own = np.where(original_index < 0, ~original_index, original_index) % parts, original_index >= 0
+    return [(np.flatnonzero(own & (fold == part)), np.flatnonzero(fold != part)) for part in range(parts)]
 
 
 def most_modes(count: int, original_index: IntArray | None = None) -> int:

@@ -33,7 +33,6 @@ What a sparsity costs in each norm is in benchmarks/NOTES.md.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from shapespace.arrays import FloatArray, IntArray
@@ -43,9 +42,9 @@ from shapespace.shell.space import ShellSpace
 from shapespace.solve.cholesky import analyse
 from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
+from shapespace.training.space.local_fields import local_fields, scale_of
 from shapespace.training.space.modes import (
     NEGLIGIBLE,
-    NEVER_HELD_OUT,
     ModeProblem,
     Modes,
     Norm,
@@ -54,8 +53,8 @@ from shapespace.training.space.modes import (
     localisation,
     pga,
     validation_norm,
+    with_local,
 )
-from shapespace.training.space.soft_fields import SoftFields
 
 #: ADMM iterations on modes before the next modes, and their over-relaxation, between 1 and 2.
 ADMM_ITERATIONS, OVERRELAXATION = 5, 1.6
@@ -85,18 +84,17 @@ def find_modes(
     fields: FloatArray,
     count: int,
     original_index: IntArray | None = None,
-    soft: SoftFields | None = None,
+    local: float = 0.0,
 ) -> Modes:
-    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3) and of soft fields, as configured. Raises ModeError
-    if the count or the sparsity is not possible.
+    """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured, and of their ``local`` fields with
+    this share of the variance. Raises ModeError if the count or the sparsity is not possible.
     """
-    if soft:
+    if local:
         n = len(fields)
-        original_index = np.arange(n) if original_index is None else original_index
-        problem = ModeProblem(space, mean, np.concatenate([fields, soft.fields]), 1, "vertices")
-        rows = problem.D * np.sqrt(problem.areas)
-        every = np.concatenate([fields, soft.scale(rows[:n], rows[n:]) * soft.fields])
-        whose = np.concatenate([original_index, np.full(len(soft.fields), NEVER_HELD_OUT)])
+        others = local_fields(space.reference.with_vertices(mean), fields)
+        others *= scale_of(others, fields, local)
+        every = np.concatenate([fields, others.reshape(-1, *mean.shape)])
+        whose = with_local(np.arange(n) if original_index is None else original_index, others)
         found = find_modes(settings, space, mean, every, count, whose)
         codes, explained = coefficients(space, mean, fields, found.vertices, settings.norm)
         spread = np.sqrt((found.coefficients[n:] ** 2).sum(axis=0) / n)
@@ -194,11 +192,10 @@ class _Trial:
     """Modes without the shapes of one inner fold, and their error on these shapes."""
 
     def __init__(
-        self, space: ShellSpace, mean: FloatArray, fields: FloatArray, held: NDArray[np.bool_], count: int, norm: Norm
+        self, space: ShellSpace, mean: FloatArray, kept: FloatArray, held: FloatArray, count: int, norm: Norm
     ) -> None:
-        kept = fields[~held]
         self._judge = ModeProblem(space, mean, kept, 1, validation_norm(norm))
-        self._unseen = self._judge.balanced(fields[held])
+        self._unseen = self._judge.balanced(held)
         self._problem = _SparseProblem(space, mean, kept, count, norm)
         *self._start, self._highest = self._problem.start(count)
         self._modes = [each.copy() for each in self._start]
@@ -235,7 +232,9 @@ def _chosen_sparsity(
     originals = int(original_index.max()) + 1
     folds = inner_folds(original_index) if originals > 1 else []
     enough = -(-HELD_OUT * len(folds) // originals)
-    trials = [_Trial(space, mean, fields, held, min(count, int((~held).sum())), norm) for held in folds[:enough]]
+    trials = [
+        _Trial(space, mean, fields[kept], fields[held], min(count, len(kept)), norm) for held, kept in folds[:enough]
+    ]
     if not trials:
         return 0.0
     least = float(np.concatenate([trial.least for trial in trials]).mean())

@@ -5,10 +5,14 @@ These are the cheapest maps from codes to shapes. They need no exponential and n
 
 - "vertices": x̄ is the arithmetic mean of aligned shapes, and the u_j are their principal components. Modes add up as
   blend shapes do.
-- "nric": x̄ is the mean of lengths and angles (NRIC), and the u_j are principal components in the weighted norm of
-  reconstruction. Gauss–Newton finds the vertices. Limbs can bend, but an angle changes in proportion to the code.
+- "nric": x̄ is the mean of lengths and angles (NRIC). Gauss–Newton finds the vertices. Limbs can bend, but an angle
+  changes in proportion to the code.
 - "differential": the coordinates are rotations and stretches of faces, from the mean shape. One Poisson equation gives
   the vertices, see `face_coordinates`.
+
+The u_j are principal components in a norm. The norm of the coordinates, with the weights of reconstruction or with
+areas of faces, is that of the literature. The norm of vertices measures the motions that the coordinates cause at the
+mean, as users see them.
 
 Mirror images may be among the shapes.
 """
@@ -22,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import NRICJacobian, WeightedNorm, nric, unwrap
 from shapespace.coordinates.reconstruction import DEFAULT_ETA, Reconstructor
 from shapespace.mesh.rigid_motion import align
@@ -32,10 +36,12 @@ from shapespace.solve.outcome import Status
 from shapespace.training.runs.workers import run
 from shapespace.training.space.codes import Codes, NearestCode, gathered, nearest_code
 from shapespace.training.space.face_coordinates import FaceCoordinates
+from shapespace.training.space.local_fields import local_fields, scale_of
 from shapespace.training.space.modes import NEGLIGIBLE, ModeError
-from shapespace.training.space.soft_fields import SoftFields
 
 StraightKind = Literal["vertices", "nric", "differential"]
+#: The norm in which modes are principal components.
+LineNorm = Literal["coordinates", "vertices"]
 #: Tolerance of vertices from lengths and angles, as a share of the diagonal.
 TOLERANCE = 1e-6
 #: Most Gauss–Newton steps for a shape. Shapes near the training shapes take at most 30; a search that tries codes far
@@ -45,8 +51,8 @@ ITERATIONS = 60
 ROUNDING = 1e-9
 #: Smallest area of a face of the mean, as a share of its area in the reference: below it the mean has collapsed.
 LEAST_AREA = 1e-3
-#: Largest motion of a vertex, as a share of the diagonal, where coordinates are differentiated.
-SMALL_MOTION = 1e-4
+#: Solvers at the reference, which are made when they are needed.
+SOLVERS = ("_reconstruct", "differential")
 #: Rounds of the mean of differential coordinates. The last moves no vertex by more than 1e-5 of the diagonal.
 ROUNDS = 6
 
@@ -62,13 +68,14 @@ class StraightLines:
     reference: TriangleMesh  # the shape of the code 0, at the position of the collection's reference
     mean: FloatArray  # (q,) x̄, flat vertices, NRIC or differential coordinates
     modes: FloatArray  # (m, q) u_j, scaled so that the largest coefficient of a shape is 1
-    weights: FloatArray  # (q,) weights of squares in the norm
+    weights: FloatArray  # (q,) or (3V,) weights of squares in the norm
     coefficients: FloatArray  # (n, m) orthogonal projections of the shapes
     eta: float = DEFAULT_ETA  # weight of the angles
-    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by soft fields, if there are any
+    norm: LineNorm = "coordinates"
+    spread: FloatArray | None = None  # (m,) standard deviations of coefficients by local fields, if there are any
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name not in ("_reconstruct", "differential")}
+        return {name: value for name, value in self.__dict__.items() if name not in SOLVERS}
 
     @classmethod
     def of(
@@ -76,27 +83,27 @@ class StraightLines:
         kind: StraightKind,
         shapes: FloatArray,
         reference: TriangleMesh,
-        kept: IntArray | None = None,
         eta: float = DEFAULT_ETA,
         vertex_counts: FloatArray | None = None,
-        soft: SoftFields | None = None,
+        norm: LineNorm = "coordinates",
+        share: float = 0.0,
     ) -> StraightLines:
-        """Find the mean of shapes (n, V, 3) in any position, and all principal modes of the shapes ``kept``, or of all,
-        and of ``soft`` fields.
+        """Find the mean of shapes (n, V, 3) in any position, and all their principal modes, see `along`.
 
-        In the norm of lines of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once.
-        So a simplified mesh has nearly the modes of the fine mesh.
+        In the norm of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once. So a
+        simplified mesh has nearly the modes of the fine mesh.
 
         Raises ModeError if the shapes have no such mean, or are all the same.
         """
         if not np.isfinite(shapes).all():
             raise ModeError("a shape has a coordinate that is not finite")
+        by_vertex = np.ones(shapes[0].size) if vertex_counts is None else np.repeat(vertex_counts, 3)
         if kind == "vertices":
             shapes = align(shapes, align(shapes, reference.vertices).mean(axis=0))
             rows = shapes.reshape(len(shapes), -1)
             mean = rows.mean(axis=0)
             centre = mean.reshape(-1, 3)
-            weights = np.ones(len(mean)) if vertex_counts is None else np.repeat(vertex_counts, 3)
+            weights = by_vertex
         elif kind == "differential":
             coordinates = _about_their_mean(shapes, reference)
             centre, weights, rows = coordinates.base.vertices, coordinates.weights, coordinates(shapes)
@@ -117,31 +124,50 @@ class StraightLines:
             # The mean in its final position, with the shapes around it.
             rows = align(shapes, centre).reshape(len(shapes), -1)
             mean = centre.ravel()
-        offsets = (rows - mean) * np.sqrt(weights)
-        some = offsets if kept is None else offsets[kept]
-        if soft:
-            slopes = _slopes(kind, soft.fields, reference.with_vertices(centre)) * np.sqrt(weights)
-            some = np.concatenate([some, soft.scale(some, slopes) * slopes])
-        u, s, axes = np.linalg.svd(some, full_matrices=False)
-        number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
         size = 1.0 if kind == "differential" else np.sqrt((mean**2) @ weights)
-        if s[0] <= ROUNDING * size:
+        none = np.empty((0, len(mean)))
+        bare = cls(kind, reference.with_vertices(centre), mean, none, weights, none, eta)
+        offsets = rows - mean
+        if ((offsets**2 @ weights) <= (ROUNDING * size) ** 2).all():
             raise ModeError("there are no modes: all shapes are the same as the mean")
+        if norm == "vertices":
+            bare = replace(bare, norm=norm, weights=by_vertex)
+        return bare.along(offsets, share)
+
+    def along(self, offsets: FloatArray, share: float = 0.0, local: FloatArray | None = None) -> StraightLines:
+        """Return the lines through the same mean along all principal modes of offsets (n, q) of shapes.
+
+        In the norm of vertices, local fields may add a ``share`` of the variance. They are those of the offsets, or
+        ``local`` (n, k, V, 3).
+        """
+        n, rows = len(offsets), self.weighted(offsets)
+        fields = np.empty((0, self.reference.vertices.size))
+        if share:
+            if local is None:
+                local = local_fields(self.reference, self.moved(offsets))
+            fields = local.reshape(-1, fields.shape[1])
+            others = fields * np.sqrt(self.weights)
+            scale = scale_of(others, rows, share)
+            fields, rows = scale * fields, np.concatenate([rows, scale * others])
+        u, s, _ = np.linalg.svd(rows, full_matrices=False)
+        number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
         coefficients = (u * s)[:, :number]
         peaks = coefficients[np.abs(coefficients).argmax(axis=0), np.arange(number)]
-        n = len(offsets) if kept is None else len(kept)
-        spread = np.sqrt((coefficients[n:] ** 2).sum(axis=0) / n) / np.abs(peaks) if soft else None
-        plain = np.divide(axes[:number], np.sqrt(weights), out=np.zeros_like(axes[:number]), where=weights > 0)
-        return cls(
-            kind=kind,
-            reference=reference.with_vertices(centre),
-            mean=mean,
-            modes=plain * peaks[:, None],
-            weights=weights,
+        parts = (u[:, :number] / s[:number] * peaks).T
+        modes = parts[:, :n] @ offsets
+        if share:
+            modes += self.slopes((parts[:, n:] @ fields).reshape(number, -1, 3))
+        return self._with(
+            modes=modes,
             coefficients=coefficients[:n] / peaks,
-            eta=eta,
-            spread=spread,
+            spread=np.sqrt((coefficients[n:] ** 2).sum(axis=0) / n) / np.abs(peaks) if share else None,
         )
+
+    def _with(self, **changes: Any) -> StraightLines:
+        """Return the lines with some changes, and the same solvers."""
+        found = replace(self, **changes)
+        found.__dict__.update({name: self.__dict__[name] for name in SOLVERS if name in self.__dict__})
+        return found
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -155,7 +181,7 @@ class StraightLines:
     def first(self, count: int) -> StraightLines:
         """Return the lines along the strongest modes alone."""
         spread = None if self.spread is None else self.spread[:count]
-        return replace(self, modes=self.modes[:count], coefficients=self.coefficients[:, :count], spread=spread)
+        return self._with(modes=self.modes[:count], coefficients=self.coefficients[:, :count], spread=spread)
 
     @cached_property
     def explained(self) -> FloatArray:
@@ -163,10 +189,36 @@ class StraightLines:
         energies = self.squares * (self.coefficients**2).sum(axis=0)
         return energies / energies.sum()
 
+    def moved(self, offsets: FloatArray) -> FloatArray:
+        """Return motions (n, V, 3) of vertices from the mean along offsets (n, q), to first order."""
+        if self.kind == "vertices":
+            return offsets.reshape(len(offsets), -1, 3)
+        return self._change(self.reference.vertices, self.mean, offsets)
+
+    def slopes(self, fields: FloatArray) -> FloatArray:
+        """Return the derivatives (n, q) of the coordinates of the mean along vertex fields (n, V, 3)."""
+        if self.kind == "vertices":
+            return fields.reshape(len(fields), -1)
+        return self.differential.along(fields) if self.kind == "differential" else self._nric_along(fields)
+
+    def _nric_along(self, fields: FloatArray) -> FloatArray:
+        jacobian = NRICJacobian(self.reference.connectivity)
+        matrix = jacobian.matrix(jacobian.gradients(self.reference.vertices))
+        return (matrix @ fields.reshape(len(fields), -1).T).T
+
+    def weighted(self, offsets: FloatArray) -> FloatArray:
+        """Return rows (n, r) whose sums of squares are the squares of offsets (n, q) in the norm."""
+        some = self.moved(offsets).reshape(len(offsets), -1) if self.norm == "vertices" else offsets
+        return some * np.sqrt(self.weights)
+
+    @cached_property
+    def _weighted_modes(self) -> FloatArray:
+        return self.weighted(self.modes)
+
     @property
     def squares(self) -> FloatArray:
         """``‖u_j‖²`` (m,)."""
-        return (self.modes**2) @ self.weights
+        return (self._weighted_modes**2).sum(axis=1)
 
     @property
     def sizes(self) -> FloatArray:
@@ -176,18 +228,12 @@ class StraightLines:
     @cached_property
     def fields(self) -> FloatArray:
         """Vertex fields (m, V, 3) of the modes at the reference."""
-        if self.kind == "vertices":
-            return self.modes.reshape(len(self), -1, 3)
-        return self._change(self.reference.vertices, self.mean, self.modes)
+        return self.moved(self.modes)
 
     @cached_property
     def nric(self) -> FloatArray:
         """Changes (m, 2E) of lengths and angles along the modes at the reference."""
-        if self.kind == "nric":
-            return self.modes
-        jacobian = NRICJacobian(self.reference.connectivity)
-        matrix = jacobian.matrix(jacobian.gradients(self.reference.vertices))
-        return (matrix @ self.fields.reshape(len(self), -1).T).T
+        return self.modes if self.kind == "nric" else self._nric_along(self.fields)
 
     @cached_property
     def _reconstruct(self) -> Reconstructor:
@@ -208,10 +254,7 @@ class StraightLines:
 
     def motions(self, shapes: FloatArray) -> FloatArray:
         """Return motions (n, 3V) of vertices from the mean to shapes (n, V, 3), to first order."""
-        offsets = self.offsets(shapes)
-        if self.kind == "vertices":
-            return offsets
-        return self._change(self.reference.vertices, self.mean, offsets).reshape(len(shapes), -1)
+        return self.moved(self.offsets(shapes)).reshape(len(shapes), -1)
 
     def _change(self, vertices: FloatArray, at: FloatArray, directions: FloatArray) -> FloatArray:
         """Return the derivatives (k, V, 3) of the shape (V, 3) of coordinates (q,) along directions (k, q)."""
@@ -221,7 +264,7 @@ class StraightLines:
 
     def project(self, shapes: FloatArray) -> FloatArray:
         """Project shapes (n, V, 3) orthogonally onto the modes; return codes (n, m)."""
-        return (self.offsets(shapes) * self.weights) @ self.modes.T / self.squares
+        return self.weighted(self.offsets(shapes)) @ self._weighted_modes.T / self.squares
 
     def codes_of(self, shapes: FloatArray) -> FloatArray:
         """Return the codes (n, m) of shapes (n, V, 3): on lines of vertices, projections are the nearest."""
@@ -253,17 +296,6 @@ class StraightLines:
 
 def _nearest(lines: StraightLines, item: tuple[FloatArray, FloatArray]) -> NearestCode:
     return nearest_code(lines.shape, *item)
-
-
-def _slopes(kind: StraightKind, fields: FloatArray, mesh: TriangleMesh) -> FloatArray:
-    """Return the derivatives (p, q) of the coordinates of a mesh along vertex fields (p, V, 3)."""
-    if kind == "vertices":
-        return fields.reshape(len(fields), -1)
-    if kind == "nric":
-        return (NRICJacobian(mesh.connectivity)(mesh.vertices) @ fields.reshape(len(fields), -1).T).T
-    coordinates, size = FaceCoordinates(mesh), SMALL_MOTION * mesh.diagonal / np.abs(fields).max()
-    there, back = (coordinates(mesh.vertices + sign * size * fields) for sign in (1, -1))
-    return (there - back) / (2 * size)
 
 
 def _about_their_mean(shapes: FloatArray, reference: TriangleMesh) -> FaceCoordinates:

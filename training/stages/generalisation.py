@@ -16,9 +16,10 @@ def measure_generalisation(run: Run) -> None:
     """Write ``generalisation.json``: errors of modes and of principal components on shapes left out of training.
 
     A fifth of the shapes is left out of mean, logarithms, modes and their number, and of the choice of the map. Maps
-    that were clearly worse on all shapes are not compared again. Below ten shapes, each shape is left out in its turn.
-    Exponentials stand for networks, in at most LIGHT_STEPS steps. The space remembers the other shapes if the bundle
-    does. The same is measured with half as many modes. ``least-general.npz`` has the shape with the largest error.
+    that were clearly worse on all shapes are not compared again, nor local fields that did not help. Below ten shapes,
+    each shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The space
+    remembers the other shapes if the bundle does. The same is measured with half as many modes.
+    ``least-general.npz`` has the shape with the largest error.
     """
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
@@ -33,6 +34,7 @@ def measure_generalisation(run: Run) -> None:
             "first_step": first_step,
             "remember": run.config.export.examples,
             "among": hopeful(chosen["kind"], chosen["errors"]) if chosen else COST,
+            "vary": bool(chosen.get("local_share")),
         }
         found = joined([held_out(reference, shapes, each, None, settings, material, **how) for each in some])
     except (ModeError, NotPositiveDefiniteError) as error:  # the model is still of use

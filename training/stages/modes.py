@@ -16,7 +16,6 @@ from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.geometry import GeometryChoice, straight_lines
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count
-from shapespace.training.space.soft_fields import DEVIATIONS
 from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.stages.stage import Run, Stage, StageWarning, against_failures, listed
 
@@ -36,10 +35,11 @@ def decompose(run: Run) -> None:
     steps = directory.log_steps()
     found = logarithms(space, centre.vertices, shapes, steps)
     own = mode_count(settings, space, centre.vertices, found.fields, original_index)
-    count = own.count
+    chosen = directory.geometry.read_if_written()
+    count, local = own.count, own.local or (GeometryChoice(**chosen).local if chosen else None)
     plain = settings.model_copy(update={"sparsity": 0})
     dense, sparse = (
-        find_modes(each, space, centre.vertices, found.fields, count, original_index, own.soft)
+        find_modes(each, space, centre.vertices, found.fields, count, original_index, local.share if local else 0.0)
         for each in (plain, settings)
     )
     shooting = steps
@@ -62,21 +62,21 @@ def decompose(run: Run) -> None:
         "pga_explained": dense.explained,
         "linearised_logarithms": len(found.fallbacks),
         "asked": count if settings.count == "auto" else settings.count,
-        "soft_share": own.soft.share if own.soft else 0.0,
+        "local_share": local.share if local else 0.0,
         "log_steps": steps,
         "exponential_steps": shooting,
         "steps": list(found.steps),
         "via": list(found.via),
     }
-    _write(directory, arrays, codes, sparse.spread, facts, reasons=list(found.reasons), history=sparse.history)
+    room = None if sparse.spread is None or local is None else local.room(sparse.spread)
+    _write(directory, arrays, codes, room, facts, reasons=list(found.reasons), history=sparse.history)
 
 
 def _straighten(run: Run) -> None:
     """Write the same files for straight lines. Their modes are principal, and need no logarithm."""
     directory, chosen = run.directory, GeometryChoice(**run.directory.geometry.read())
     shapes, centre = directory.shapes.read()["vertices"], directory.mean_mesh()
-    material, counts = run.config.shell_material, directory.vertex_counts()
-    every = straight_lines(chosen, shapes, directory.reference_mesh(), material, counts)
+    every = straight_lines(chosen, shapes, directory.reference_mesh(), directory.vertex_counts())
     lines = every.first(chosen.count or len(every))
     arrays = {
         "nric": lines.nric,
@@ -94,29 +94,30 @@ def _straighten(run: Run) -> None:
         "pga_explained": explained,
         "linearised_logarithms": 0,
         "asked": len(lines) if run.config.modes.count == "auto" else run.config.modes.count,
-        "soft_share": chosen.soft_share,
+        "local_share": chosen.local_share,
         "log_steps": 1,
         "steps": [1] * len(shapes),
     }
-    _write(directory, arrays, lines.nearest(shapes), lines.spread, facts, history=[])
+    room = None if lines.spread is None or chosen.local is None else chosen.local.room(lines.spread)
+    _write(directory, arrays, lines.nearest(shapes), room, facts, history=[])
 
 
 def _write(
     directory: RunDirectory,
     arrays: Mapping[str, NDArray],
     found: Codes,
-    spread: FloatArray | None,
+    room: FloatArray | None,
     facts: Mapping[str, Any],
     **details: Any,
 ) -> None:
     """Write modes, the codes of the shapes with their bounds, and facts. ``details`` are too long for the log.
 
-    Bounds also have room for soft fields, whose codes have a standard deviation ``spread`` (m,).
+    Bounds also have ``room`` (m,) on each side for what single regions do.
     """
     given = directory.shapes.read()
     shapes, originals = given["vertices"], int(given["original"].max()) + 1
-    soft = np.empty((0, found.codes.shape[1])) if spread is None else DEVIATIONS * np.stack([-spread, spread])
-    lower, upper = box_of(np.concatenate([found.codes, soft]))
+    around = np.empty((0, found.codes.shape[1])) if room is None else np.stack([-room, room])
+    lower, upper = box_of(np.concatenate([found.codes, around]))
     coefficients = {"coefficients": found.codes[:originals], "mirrored_coefficients": found.codes[originals:]}
     every = {**arrays, **coefficients, "lower": lower, "upper": upper}
     directory.modes_by_strength.write(**every)
