@@ -49,8 +49,8 @@ models](generalisation.md#stronger-simple-models). Empty cells: there are too fe
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Look at the sliders.** {counts} Those beyond nine are [soft modes](../explanation/choosing.md#few-shapes), along
-  which an elastic surface bends easily. They can fit an unseen shape, but none of your shapes shows them.{rises}
+- **Look at the sliders.** {counts} Those beyond nine come from [local fields](../explanation/choosing.md#few-shapes):
+  they move single regions. They can fit an unseen shape, but none of your shapes shows them as a whole.{rises}
 
 ## How it was measured
 
@@ -167,7 +167,7 @@ def rises(found: dict[tuple[str, int], dict[str, Any]]) -> Iterable[str]:
             most, before = max(row["counts"]), max(fewer["counts"])
             yield (
                 f"\n- **More shapes may have fewer modes.** With {count} shapes, {name} has {most:.0f} modes, none of "
-                f"them soft. With {count // 2} it has up to {before:.0f}, and a smaller error."
+                f"them local. With {count // 2} it has up to {before:.0f}, and a smaller error."
             )
 
 

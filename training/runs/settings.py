@@ -100,7 +100,7 @@ class ModeSettings(SettingsTable):
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, less than the number of shapes. ``auto`` minimises the relative error of held-out shapes plus
-    0.5 % for each mode. For few shapes it adds soft modes, along which the surface bends easily."""
+    0.5 % for each mode. For few shapes it adds modes of single regions."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
     """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The others are
     straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``

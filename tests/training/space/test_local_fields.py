@@ -68,10 +68,10 @@ def test_a_local_field_turns_and_stretches_its_region_alone() -> None:
     pose = figure.pose(np.full((1, len(figure.ANGLES)), 0.1)) - rest.vertices
     found = FaceCoordinates(rest).along(local_fields(rest, pose)[0])
     amounts = (found.reshape(*windows(rest).shape, -1)[..., 3:] ** 2).sum(axis=2)
+    assert (windows(rest) < 0.01).mean() > 0.3
     for window, stretched in zip(windows(rest), amounts * face_areas(rest.vertices, rest.faces), strict=True):
-        outside = window < 0.03
-        assert outside.mean() > 0.1
-        assert stretched[outside].sum() < 0.05 * stretched.sum()
+        outside = window < 0.01
+        assert stretched[outside].sum() < 0.02 * stretched.sum()
 
 
 def test_eight_poses_come_nearer_to_unseen_poses_with_local_fields() -> None:
