@@ -201,13 +201,6 @@ class _Map:
         """Local fields (n, k, V, 3) of the shapes that are compared."""
         return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
 
-    @property
-    def lines(self) -> StraightLines:
-        """The straight lines."""
-        if self.straight is None:
-            raise ValueError("exponentials are no straight lines")
-        return self.straight
-
 
 class _Comparison:
     """Errors of all maps on the same held-out shapes."""
@@ -242,9 +235,8 @@ class _Comparison:
         supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in every)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
-        folded = 0.0
-        if vertices := maps.get("vertices"):
-            folded = self._folded(vertices.lines.first(min(count, FOLDED_MODES)))
+        straight = maps["vertices"].straight if "vertices" in maps else None
+        folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
         for index in every:
@@ -308,15 +300,19 @@ class _Comparison:
         trying, best = list(LOCAL_SHARES), 0.0
         for index in folds(int(self._own.max()) + 1):
             kept = int(self._own.max()) + 1 - len(index)
-            for share in trying:
-                found = self._distances(chosen, index, max(1, min(chosen.own.count, kept - 1)), share)
-                away[share] = np.concatenate([away[share], found])
+            count = max(1, min(chosen.own.count, kept - 1))
+            try:
+                for share in trying:
+                    away[share] = np.concatenate([away[share], self._distances(chosen, index, count, share)])
+            except (ModeError, NotPositiveDefiniteError):  # the map fails without these shapes
+                return 0.0, 0.0
             best = min(trying, key=lambda share: away[share].mean())
             if len(away[best]) >= ENOUGH:
                 trying = [each for each in trying if each == best or not _certainly_positive(away[each] - away[best])]
             if len(trying) == 1:
                 break
-        return best, 1 - float(away[best][: len(away[0])].mean() / away[0][: len(away[best])].mean())
+        both = min(len(away[0]), len(away[best]))
+        return best, 1 - float(away[best][:both].mean() / away[0][:both].mean())
 
     def _distances(self, chosen: _Map, index: IntArray, count: int, share: float = 0.0) -> FloatArray:
         """Return distances (k,) of shapes that are held out from the nearest shapes of a map."""
