@@ -10,9 +10,9 @@ These are the cheapest maps from codes to shapes. They need no exponential and n
 - "differential": the coordinates are rotations and stretches of faces, from the mean shape. One Poisson equation gives
   the vertices, see `face_coordinates`.
 
-The u_j are principal components in a norm. The norm of the coordinates, with the weights of reconstruction or with
-areas of faces, is that of the literature. The norm of vertices measures the motions that the coordinates cause at the
-mean, as users see them.
+The u_j are principal components in a norm. The literature takes the norm of the coordinates, with the weights of
+reconstruction or areas of faces. The norm of vertices measures the motions that the coordinates cause at the mean, as
+users see them.
 
 Mirror images may be among the shapes.
 """
