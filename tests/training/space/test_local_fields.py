@@ -21,7 +21,7 @@ from shapespace.training.space.generalisation import PrincipalComponents, vertex
 from shapespace.training.space.geometry import choose_geometry, straight_lines
 from shapespace.training.space.held_out import held_out
 from shapespace.training.space.local_fields import WIDTH, local_fields, windows
-from shapespace.training.space.modes import most_modes
+from shapespace.training.space.modes import inner_folds, most_modes, with_local
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run
@@ -93,6 +93,17 @@ def test_no_more_modes_than_asked_for_or_than_shapes(ellipsoid: TriangleMesh, wa
     assert held_out(ellipsoid, waves, index, None, AUTO, Material()).counts[-1] > KNOWN - 1
     asked = ModeSettings(geometry="vertices", count=KNOWN + 5)
     assert held_out(ellipsoid, waves, index, None, asked, Material()).counts[-1] == KNOWN - 1
+
+
+def test_local_fields_are_held_out_with_their_shapes() -> None:
+    originals = np.array([0, 1, 2, 3, 4, 5, 0, 1])  # the last two are mirror images
+    whose = with_local(originals, np.empty((8, 3, 1, 3)))
+    folds = inner_folds(whose)
+    assert sorted(np.concatenate([held for held, _ in folds])) == list(range(8)), "each shape once, no local field"
+    for held, kept in folds:
+        own = np.concatenate([originals, np.repeat(originals, 3)])
+        assert not set(own[held]) & set(own[kept])
+        assert set(own[held]) | set(own[kept]) == set(range(6))
 
 
 def test_local_fields_come_where_they_help() -> None:
