@@ -75,5 +75,5 @@ def local_fields(mesh: TriangleMesh, fields: FloatArray) -> FloatArray:
 
 
 def scale_of(local: FloatArray, rows: FloatArray, share: float) -> float:
-    """Return the factor of local fields, so that their squares are this share of the shapes' squares, from rows of both."""
+    """Return the factor of local fields that makes their squares this share of the shapes' squares, both as rows."""
     return float(np.sqrt(share * (rows**2).sum() / (local**2).sum()))
