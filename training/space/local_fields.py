@@ -3,7 +3,7 @@
 A few shapes differ in few directions. An unseen shape may bend one limb as one of them does, and another limb as
 another does. Local fields show such directions: a window keeps the turns and stretches of the faces in a region, and
 fades out around it. The rest of the surface follows without turning or stretching. Added to the covariance of the
-shapes, they lead modes to directions that the shapes do not have together (Wilms, Handels and Ehrhardt,
+shapes, they lead modes to directions that the shapes do not have together (Wilms et al.,
 "Multi-resolution multi-object statistical shape models based on the locality assumption", 2017; there with vertices).
 """
 
