@@ -180,9 +180,9 @@ def straight_lines(
     return StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts, norm="vertices", share=share)
 
 
-#: Map from indices of the shapes that modes are found from, indices of unseen shapes, a number of modes, and the share
-#: of local fields with these fields (n, k, V, 3), to the nearest shapes.
-_Nearest = Callable[[IntArray, IntArray, int, float, FloatArray | None], FloatArray]
+#: Map from indices of the shapes that modes are found from, indices of unseen shapes, a number of modes, and local
+#: fields (n, k, V, 3), to the nearest shapes.
+_Nearest = Callable[[IntArray, IntArray, int, FloatArray | None], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,11 +316,12 @@ class _Comparison:
 
     def _distances(self, chosen: _Map, index: IntArray, count: int, share: float = 0.0) -> FloatArray:
         """Return distances (k,) of shapes that are held out from the nearest shapes of a map."""
-        held = np.isin(self._own, index)
-        given = self._some[index]
-        kept = np.flatnonzero(~held)
-        near = chosen.nearest(kept, index, count, share, chosen.local[kept] if share else None)
-        return vertex_distances(near, given, self._reference.diagonal).mean(axis=1)
+        kept, local = np.flatnonzero(~np.isin(self._own, index)), None
+        if share:
+            local = chosen.local[kept]
+            local = scale_of(local, chosen.rows[kept], share) * local
+        near = chosen.nearest(kept, index, count, local)
+        return vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
 
     def _on_lines(
         self,
@@ -329,11 +330,10 @@ class _Comparison:
         kept: IntArray,
         index: IntArray,
         count: int,
-        share: float,
         local: FloatArray | None,
     ) -> FloatArray:
         """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
-        return lines.along(offsets[kept], share, local).first(count).nearest(self._some[index]).vertices
+        return lines.along(offsets[kept], local).first(count).nearest(self._some[index]).vertices
 
     def _on_exponentials(
         self,
@@ -343,13 +343,11 @@ class _Comparison:
         kept: IntArray,
         index: IntArray,
         count: int,
-        share: float,
         local: FloatArray | None,
     ) -> FloatArray:
         """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
         some = fields[kept]
         if local is not None:
-            local = scale_of(local, some, share) * local
             some = np.concatenate([some, local.reshape(-1, *mean.shape)])
         modes = pga(space, mean, some, count, "vertices").vertices
         start, _ = coefficients(space, mean, fields[index], modes, "vertices")

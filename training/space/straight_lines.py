@@ -88,7 +88,8 @@ class StraightLines:
         norm: LineNorm = "coordinates",
         share: float = 0.0,
     ) -> StraightLines:
-        """Find the mean of shapes (n, V, 3) in any position, and all their principal modes, see `along`.
+        """Find the mean of shapes (n, V, 3) in any position, and all their principal modes, see `along`. In
+        the norm of vertices, local fields may add a ``share`` of the variance.
 
         In the norm of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once. So a
         simplified mesh has nearly the modes of the fine mesh.
@@ -132,35 +133,32 @@ class StraightLines:
             raise ModeError("there are no modes: all shapes are the same as the mean")
         if norm == "vertices":
             bare = replace(bare, norm=norm, weights=by_vertex)
-        return bare.along(offsets, share)
+        if not share:
+            return bare.along(offsets)
+        local = local_fields(bare.reference, bare.moved(offsets))
+        weighted = local.reshape(-1, len(by_vertex)) * np.sqrt(by_vertex)
+        return bare.along(offsets, scale_of(weighted, bare.weighted(offsets), share) * local)
 
-    def along(self, offsets: FloatArray, share: float = 0.0, local: FloatArray | None = None) -> StraightLines:
-        """Return the lines through the same mean along all principal modes of offsets (n, q) of shapes.
-
-        In the norm of vertices, local fields may add a ``share`` of the variance. They are those of the offsets, or
-        ``local`` (n, k, V, 3).
+    def along(self, offsets: FloatArray, local: FloatArray | None = None) -> StraightLines:
+        """Return the lines through the same mean along all principal modes of offsets (n, q) of shapes and, in the norm
+        of vertices, of ``local`` fields (n, k, V, 3).
         """
         n, rows = len(offsets), self.weighted(offsets)
-        fields = np.empty((0, self.reference.vertices.size))
-        if share:
-            if local is None:
-                local = local_fields(self.reference, self.moved(offsets))
-            fields = local.reshape(-1, fields.shape[1])
-            others = fields * np.sqrt(self.weights)
-            scale = scale_of(others, rows, share)
-            fields, rows = scale * fields, np.concatenate([rows, scale * others])
+        if local is not None:
+            fields = local.reshape(-1, self.reference.vertices.size)
+            rows = np.concatenate([rows, fields * np.sqrt(self.weights)])
         u, s, _ = np.linalg.svd(rows, full_matrices=False)
         number = int((s**2 > NEGLIGIBLE * (s**2).sum()).sum())
         coefficients = (u * s)[:, :number]
         peaks = coefficients[np.abs(coefficients).argmax(axis=0), np.arange(number)]
         parts = (u[:, :number] / s[:number] * peaks).T
         modes = parts[:, :n] @ offsets
-        if share:
+        if local is not None:
             modes += self.slopes((parts[:, n:] @ fields).reshape(number, -1, 3))
         return self._with(
             modes=modes,
             coefficients=coefficients[:n] / peaks,
-            spread=np.sqrt((coefficients[n:] ** 2).sum(axis=0) / n) / np.abs(peaks) if share else None,
+            spread=np.sqrt((coefficients[n:] ** 2).sum(axis=0) / n) / np.abs(peaks) if local is not None else None,
         )
 
     def _with(self, **changes: Any) -> StraightLines:
