@@ -62,8 +62,9 @@ HOPEFUL = 1.2
 REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
-#: Shares of the variance that local fields may add to the modes of the chosen map, the smallest first.
-LOCAL_SHARES = (0.0, 0.03, 0.1, 0.3)
+#: Shares of the variance that local fields may add to the modes of the chosen map, the smallest first. The next one is
+#: tried while held-out shapes come nearer.
+LOCAL_SHARES = (0.01, 0.03, 0.1, 0.3)
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -222,6 +223,8 @@ class _Comparison:
         self._some, self._own = shapes[used], np.unique(original_index[used], return_inverse=True)[1]
         self._steps, self._first_step = _many(settings, first_step), first_step
         self._light = min(LIGHT_STEPS, self._steps)
+        self._folds = folds(int(self._own.max()) + 1)
+        self._measured: dict[tuple[Kind, int, int, float], FloatArray] = {}
 
     def choice(self) -> GeometryChoice:
         """Compare the maps fold by fold, until the choice is certain."""
@@ -231,19 +234,18 @@ class _Comparison:
                 maps[kind] = self._map(kind)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
-        every = folds(int(self._own.max()) + 1)
-        supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in every)
+        supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in self._folds)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
         straight = maps["vertices"].straight if "vertices" in maps else None
         folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
-        for index in every:
+        for fold, index in enumerate(self._folds):
             held_out += len(index)
             for each in list(away):
                 with suppress(ModeError, NotPositiveDefiniteError):
-                    found = [self._distances(maps[each], index, some) for some in counts]
+                    found = [self._distances(maps[each], fold, some) for some in counts]
                     away[each] = np.concatenate([away[each], np.mean(found, axis=0)])
                     continue
                 del away[each]
@@ -296,32 +298,45 @@ class _Comparison:
 
     def _local_share(self, chosen: _Map) -> tuple[float, float]:
         """Return the share of local fields with the least error on held-out shapes, and by how much it lowers it."""
-        away = {share: np.empty(0) for share in LOCAL_SHARES}
-        trying, best = list(LOCAL_SHARES), 0.0
-        for index in folds(int(self._own.max()) + 1):
+        best = 0.0
+        try:
+            plain = least = self._all_distances(chosen, 0.0)
+            for share in LOCAL_SHARES:
+                away = self._all_distances(chosen, share, least)
+                if away.mean() >= least[: len(away)].mean():
+                    break
+                best, least = share, away
+        except (ModeError, NotPositiveDefiniteError):  # the map fails without some of the shapes
+            return 0.0, 0.0
+        return best, 1 - float(least.mean() / plain.mean())
+
+    def _all_distances(self, chosen: _Map, share: float, least: FloatArray | None = None) -> FloatArray:
+        """Return distances (n,) of all shapes that are compared, each from the map without its fold.
+
+        Folds end where these are certainly larger than the ``least`` distances (n,).
+        """
+        away = np.empty(0)
+        for fold, index in enumerate(self._folds):
             kept = int(self._own.max()) + 1 - len(index)
             count = max(1, min(chosen.own.count, kept - 1))
-            try:
-                for share in trying:
-                    away[share] = np.concatenate([away[share], self._distances(chosen, index, count, share)])
-            except (ModeError, NotPositiveDefiniteError):  # the map fails without these shapes
-                return 0.0, 0.0
-            best = min(trying, key=lambda share: away[share].mean())
-            if len(away[best]) >= ENOUGH:
-                trying = [each for each in trying if each == best or not _certainly_positive(away[each] - away[best])]
-            if len(trying) == 1:
+            away = np.concatenate([away, self._distances(chosen, fold, count, share)])
+            if least is not None and len(away) >= ENOUGH and _certainly_positive(away - least[: len(away)]):
                 break
-        both = min(len(away[0]), len(away[best]))
-        return best, 1 - float(away[best][:both].mean() / away[0][:both].mean())
+        return away
 
-    def _distances(self, chosen: _Map, index: IntArray, count: int, share: float = 0.0) -> FloatArray:
-        """Return distances (k,) of shapes that are held out from the nearest shapes of a map."""
+    def _distances(self, chosen: _Map, fold: int, count: int, share: float = 0.0) -> FloatArray:
+        """Return distances (k,) of the shapes of a fold from the nearest shapes of a map."""
+        key = chosen.kind, fold, count, share
+        if key in self._measured:
+            return self._measured[key]
+        index = self._folds[fold]
         kept, local = np.flatnonzero(~np.isin(self._own, index)), None
         if share:
             local = chosen.local[kept]
             local = scale_of(local, chosen.rows[kept], share) * local
         near = chosen.nearest(kept, index, count, local)
-        return vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
+        self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
+        return self._measured[key]
 
     def _on_lines(
         self,
