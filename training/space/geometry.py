@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -181,26 +182,58 @@ def straight_lines(
     return StraightLines.of(choice.kind, shapes, reference, vertex_counts=vertex_counts, norm="vertices", share=share)
 
 
-#: Map from indices of the shapes that modes are found from, indices of unseen shapes, a number of modes, and local
-#: fields (n, k, V, 3), to the nearest shapes.
-_Nearest = Callable[[IntArray, IntArray, int, FloatArray | None], FloatArray]
+@dataclass(frozen=True, eq=False)
+class _Map(ABC):
+    """A map of all shapes, whose modes are found without some of those that are compared."""
+
+    kind: Kind
+    own: ModeCount
+    mean: TriangleMesh
+    shapes: FloatArray  # (n, V, 3) shapes that are compared
+    rows: FloatArray  # (n, 3V) motions of vertices from the mean to them
+
+    @cached_property
+    def _local(self) -> FloatArray:
+        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+
+    def nearest(self, kept: IntArray, index: IntArray, count: int, share: float) -> FloatArray:
+        """Return the shapes (k, V, 3) nearest to shapes ``index``, with a number of modes of the shapes ``kept``.
+
+        Local fields of these have a ``share`` of the variance.
+        """
+        local = None
+        if share:
+            local = self._local[kept]
+            local = scale_of(local, self.rows[kept], share) * local
+        return self._nearest(kept, index, count, local)
+
+    @abstractmethod
+    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
+        """Return the shapes (k, V, 3), with local fields (n, k, V, 3) as they are."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
-    """A map of all shapes, of which modes are found without some of them."""
+class _Lines(_Map):
+    lines: StraightLines
+    offsets: FloatArray  # (n, q)
 
-    kind: Kind
-    nearest: _Nearest
-    own: ModeCount
-    mean: TriangleMesh
-    rows: FloatArray  # (n, 3V) motions of vertices to the shapes that are compared
-    straight: StraightLines | None = None
+    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
+        return self.lines.along(self.offsets[kept], local).first(count).nearest(self.shapes[index]).vertices
 
-    @cached_property
-    def local(self) -> FloatArray:
-        """Local fields (n, k, V, 3) of the shapes that are compared."""
-        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+
+@dataclass(frozen=True, eq=False)
+class _Exponentials(_Map):
+    space: ShellSpace
+    fields: FloatArray  # (n, V, 3) logarithms
+    steps: int
+
+    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
+        mean, fields = self.mean.vertices, self.fields[kept]
+        if local is not None:
+            fields = np.concatenate([fields, local.reshape(-1, *mean.shape)])
+        modes = pga(self.space, mean, fields, count, "vertices").vertices
+        start, _ = coefficients(self.space, mean, self.fields[index], modes, "vertices")
+        return nearest_codes(self.space, mean, modes, self.shapes[index], start, self.steps).vertices
 
 
 class _Comparison:
@@ -237,8 +270,8 @@ class _Comparison:
         supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in self._folds)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
-        straight = maps["vertices"].straight if "vertices" in maps else None
-        folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
+        vertices = maps.get("vertices")
+        folded = self._folded(vertices.lines.first(min(count, FOLDED_MODES))) if isinstance(vertices, _Lines) else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
         for fold, index in enumerate(self._folds):
@@ -274,15 +307,15 @@ class _Comparison:
         if kind == "exponential":
             # They must reach enough shapes.
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-            count = mode_count(self._settings, *at, self._own)
-            centre = self._reference.with_vertices(at[1])
-            return _Map(kind, partial(self._on_exponentials, *at), count, centre, at[2].reshape(len(self._some), -1))
+            own, (space, mean, fields) = mode_count(self._settings, *at, self._own), at
+            centre, rows = self._reference.with_vertices(mean), fields.reshape(len(fields), -1)
+            return _Exponentials(kind, own, centre, self._some, rows, space, fields, self._light)
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)
+        own = straight_count(self._settings, lines, self._shapes, self._original_index)
         offsets = lines.offsets(self._some)
-        count = straight_count(self._settings, lines, self._shapes, self._original_index)
         rows = lines.moved(offsets).reshape(len(offsets), -1)
-        return _Map(kind, partial(self._on_lines, lines, offsets), count, lines.reference, rows, lines)
+        return _Lines(kind, own, lines.reference, self._some, rows, lines, offsets)
 
     def _chosen(self, chosen: _Map) -> GeometryChoice:
         """Return the choice of a map, with the share of local fields in its modes."""
@@ -327,46 +360,11 @@ class _Comparison:
     def _distances(self, chosen: _Map, fold: int, count: int, share: float = 0.0) -> FloatArray:
         """Return distances (k,) of the shapes of a fold from the nearest shapes of a map."""
         key = chosen.kind, fold, count, share
-        if key in self._measured:
-            return self._measured[key]
-        index = self._folds[fold]
-        kept, local = np.flatnonzero(~np.isin(self._own, index)), None
-        if share:
-            local = chosen.local[kept]
-            local = scale_of(local, chosen.rows[kept], share) * local
-        near = chosen.nearest(kept, index, count, local)
-        self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
+        if key not in self._measured:
+            index = self._folds[fold]
+            near = chosen.nearest(np.flatnonzero(~np.isin(self._own, index)), index, count, share)
+            self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
         return self._measured[key]
-
-    def _on_lines(
-        self,
-        lines: StraightLines,
-        offsets: FloatArray,
-        kept: IntArray,
-        index: IntArray,
-        count: int,
-        local: FloatArray | None,
-    ) -> FloatArray:
-        """Return the shapes (k, V, 3) nearest to shapes ``index`` on straight lines of the shapes ``kept``."""
-        return lines.along(offsets[kept], local).first(count).nearest(self._some[index]).vertices
-
-    def _on_exponentials(
-        self,
-        space: ShellSpace,
-        mean: FloatArray,
-        fields: FloatArray,
-        kept: IntArray,
-        index: IntArray,
-        count: int,
-        local: FloatArray | None,
-    ) -> FloatArray:
-        """Return the nearest exponentials (k, V, 3) of principal modes of the logarithms (n, V, 3) ``kept``."""
-        some = fields[kept]
-        if local is not None:
-            some = np.concatenate([some, local.reshape(-1, *mean.shape)])
-        modes = pga(space, mean, some, count, "vertices").vertices
-        start, _ = coefficients(space, mean, fields[index], modes, "vertices")
-        return nearest_codes(space, mean, modes, self._some[index], start, self._light).vertices
 
     def _folded(self, lines: StraightLines) -> float:
         """Return the share of random shapes that fold where no training shape has a crease."""
