@@ -331,31 +331,32 @@ class _Comparison:
 
     def _local_share(self, chosen: _Map) -> tuple[float, float]:
         """Return the share of local fields with the least error on held-out shapes, and by how much it lowers it."""
-        best = 0.0
+        best, gain = 0.0, 0.0
         try:
-            plain = least = self._all_distances(chosen, 0.0)
             for share in LOCAL_SHARES:
-                away = self._all_distances(chosen, share, least)
-                if away.mean() >= least[: len(away)].mean():
+                ours, theirs = self._compared(chosen, share, best)
+                if ours >= theirs:
                     break
-                best, least = share, away
+                best, gain = share, 1 - (1 - gain) * ours / theirs
         except (ModeError, NotPositiveDefiniteError):  # the map fails without some of the shapes
             return 0.0, 0.0
-        return best, 1 - float(least.mean() / plain.mean())
+        return best, gain
 
-    def _all_distances(self, chosen: _Map, share: float, least: FloatArray | None = None) -> FloatArray:
-        """Return distances (n,) of all shapes that are compared, each from the map without its fold.
+    def _compared(self, chosen: _Map, share: float, other: float) -> tuple[float, float]:
+        """Return the mean distances of held-out shapes with two shares of local fields.
 
-        Folds end where these are certainly larger than the ``least`` distances (n,).
+        Folds end once it is certain which is smaller.
         """
-        away = np.empty(0)
+        away = np.empty((0, 2))
         for fold, index in enumerate(self._folds):
-            kept = int(self._own.max()) + 1 - len(index)
-            count = max(1, min(chosen.own.count, kept - 1))
-            away = np.concatenate([away, self._distances(chosen, fold, count, share)])
-            if least is not None and len(away) >= ENOUGH and _certainly_positive(away - least[: len(away)]):
+            count = max(1, min(chosen.own.count, int(self._own.max()) - len(index)))
+            both = np.stack([self._distances(chosen, fold, count, each) for each in (share, other)], axis=1)
+            away = np.concatenate([away, both])
+            gaps = away[:, 0] - away[:, 1]
+            if len(away) >= ENOUGH and (_certainly_positive(gaps) or _certainly_positive(-gaps)):
                 break
-        return away
+        ours, theirs = away.mean(axis=0).tolist()
+        return ours, theirs
 
     def _distances(self, chosen: _Map, fold: int, count: int, share: float = 0.0) -> FloatArray:
         """Return distances (k,) of the shapes of a fold from the nearest shapes of a map."""
