@@ -56,6 +56,7 @@ def nearest_codes(
     start: FloatArray,
     steps: int,
     workers: int = -1,
+    centre: FloatArray | None = None,
 ) -> Codes:
     """Find the codes ``w`` that minimise ``‖exp_z̄(Σ_j w_j u_j) − x‖²`` over vertices, after rigid alignment.
 
@@ -63,12 +64,12 @@ def nearest_codes(
     the search starts, are minimisers only to first order, because the exponential is nonlinear.
 
     Modes (m, V, 3) are vertex fields at the mean (V, 3), scaled so that codes are about 1. Shapes (n, V, 3) may be in
-    any position; ``start`` (n, m) has codes nearby. The result does not depend on the number of workers.
+    any position; ``start`` (n, m) has codes nearby. The vertex field ``centre`` (V, 3) is added to all velocities. The
+    result does not depend on the number of workers.
     """
     items = [(shape, code) for shape, code in zip(shapes, start, strict=True)]
-    return gathered(
-        run(partial(_nearest, exponential_map(space, mean, modes, steps)), items, workers=workers), len(items)
-    )
+    shape_of = exponential_map(space, mean, modes, steps, centre)
+    return gathered(run(partial(_nearest, shape_of), items, workers=workers), len(items))
 
 
 def gathered(results: Iterable[tuple[int, NearestCode]], count: int) -> Codes:
@@ -157,15 +158,20 @@ def nearest_code(shape_of: ShapeMap, target: FloatArray, start: FloatArray) -> N
     return NearestCode(fit.x, align(shape_at(fit.x)[0], target), fit.iterations, fit.status)
 
 
-def exponential_map(space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int) -> ShapeMap:
-    """Return the map from codes (m,) to exponentials along modes (m, V, 3) at the mean (V, 3), which can be pickled."""
-    return partial(_exponential, space, mean, modes, steps)
+def exponential_map(
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, centre: FloatArray | None = None
+) -> ShapeMap:
+    """Return the map from codes (m,) to exponentials along modes (m, V, 3) at the mean (V, 3), which can be pickled.
+
+    The vertex field ``centre`` (V, 3) is added to all velocities.
+    """
+    return partial(_exponential, space, mean, modes, steps, np.zeros_like(mean) if centre is None else centre)
 
 
 def _exponential(
-    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, code: FloatArray
+    space: ShellSpace, mean: FloatArray, modes: FloatArray, steps: int, centre: FloatArray, code: FloatArray
 ) -> tuple[FloatArray, Callable[[], FloatArray]] | None:
-    path = exponential(space, mean, np.tensordot(code, modes, axes=1), steps)
+    path = exponential(space, mean, centre + np.tensordot(code, modes, axes=1), steps)
     if not path.converged:
         return None
     return path.vertices[-1], lambda: ExponentialDerivative(path).push_forward(modes)

@@ -117,8 +117,8 @@ def time_steps(
 
     With K = 1 the exponential is ``X̄ + Σ_j w_j u_j``: modes add up in vertices. This may come closer to unseen shapes,
     but shapes fold where limbs bend. K = 1 is chosen if it has at most the error of `LIGHT_STEPS` on held-out shapes,
-    and if random shapes rarely fold. Modes are principal modes of the other folds' logarithms, at the mean of all
-    shapes.
+    and if random shapes rarely fold. Modes are principal modes of the other folds' logarithms, see
+    `nearest_exponentials`.
 
     The settings ``log_steps`` and ``count`` matter. At most `CHOICE_SHAPES` shapes (n, V, 3), spread evenly, are held
     out. ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
@@ -175,6 +175,31 @@ def space_of(
     return space, found.vertices, logarithms(space, found.vertices, shapes, steps).fields
 
 
+def nearest_exponentials(
+    space: ShellSpace,
+    mean: FloatArray,
+    fields: FloatArray,
+    towards: FloatArray,
+    shapes: FloatArray,
+    count: int,
+    steps: int,
+    local: FloatArray | None = None,
+) -> FloatArray:
+    """Return the exponentials (k, V, 3) nearest to shapes (k, V, 3), along modes of the logarithms (n, V, 3) of others.
+
+    ``towards`` (k, V, 3) are the logarithms of the shapes. The mean (V, 3) may be the mean of all of them. So that
+    modes know nothing of the shapes, they are principal modes about the mean of the other logarithms, from which they
+    lead. ``local`` fields (…, V, 3) may join these.
+    """
+    centre = fields.mean(axis=0)
+    some = fields - centre
+    if local is not None:
+        some = np.concatenate([some, local.reshape(-1, *mean.shape)])
+    modes = pga(space, mean, some, count, "vertices").vertices
+    start, _ = coefficients(space, mean, towards - centre, modes, "vertices")
+    return nearest_codes(space, mean, modes, shapes, start, steps, centre=centre).vertices
+
+
 def _missed(
     reference: TriangleMesh,
     shapes: FloatArray,
@@ -189,8 +214,7 @@ def _missed(
     count = int(original_index.max()) + 1
     away = []
     for index in folds(count):
-        directions = pga(space, mean, fields[~np.isin(original_index, index)], modes, "vertices").vertices
-        start, _ = coefficients(space, mean, fields[index], directions, "vertices")
-        near = nearest_codes(space, mean, directions, shapes[index], start, steps).vertices
+        known = fields[~np.isin(original_index, index)]
+        near = nearest_exponentials(space, mean, known, fields[index], shapes[index], modes, steps)
         away.append(vertex_distances(near, shapes[index], 1.0))
     return float(np.concatenate(away).mean())

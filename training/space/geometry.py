@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,7 +19,7 @@ from shapespace.shell.energy import Material
 from shapespace.shell.space import FirstStep, ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.codes import box_of
 from shapespace.training.space.generalisation import (
     CHOICE_SHAPES,
     FOLDED_MODES,
@@ -29,6 +29,7 @@ from shapespace.training.space.generalisation import (
     LIGHT_STEPS,
     folds,
     many_steps,
+    nearest_exponentials,
     space_of,
     time_steps,
     vertex_distances,
@@ -37,14 +38,12 @@ from shapespace.training.space.local_fields import LocalVariation, local_fields,
 from shapespace.training.space.modes import (
     ModeCount,
     ModeError,
-    coefficients,
     left_of_held_out,
     mode_count,
-    pga,
     unseen_share,
     worthwhile_with_local,
 )
-from shapespace.training.space.straight_lines import StraightLines
+from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
@@ -64,7 +63,7 @@ REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
 #: Shares of the variance that local fields may add to the modes of the chosen map, the smallest first. The next one is
-#: tried while held-out shapes come nearer.
+#: tried until held-out shapes are certainly farther away.
 LOCAL_SHARES = (0.01, 0.03, 0.1, 0.3)
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
@@ -115,9 +114,9 @@ def choose_geometry(
     lines of vertices, of rotations and stretches, and of lengths and angles, and exponentials. All have the same
     number of modes, the smallest that one of them would have without local fields, and with few shapes also half as
     many. The cheapest map is chosen whose error is at most 2 % above every other straight line, and at most 5 % above
-    exponentials. No map remembers training shapes here. Means come from all shapes, and modes of exponentials are
-    dense, because sparse modes may cost at most 2 % more. Exponentials are left out if many shapes have no geodesic
-    from the mean.
+    exponentials. No map remembers training shapes here. Straight lines are found anew without each fold. Exponentials
+    keep the mean of all shapes, but lead from the mean of the other logarithms. Their modes are dense, because sparse
+    modes may cost at most 2 % more. They are left out if many shapes have no geodesic from the mean.
 
     If modes may ``vary``, the same folds then choose how much of the variance of its modes comes from local fields,
     unless the number of modes needs them anyway.
@@ -183,57 +182,63 @@ def straight_lines(
 
 
 @dataclass(frozen=True, eq=False)
-class _Map(ABC):
-    """A map of all shapes, whose modes are found without some of those that are compared."""
+class _Part(ABC):
+    """A map that knows nothing of the shapes of a fold."""
+
+    mean: TriangleMesh
+    rows: FloatArray  # (n, 3V) motions of vertices from the mean to the other shapes
+
+    @cached_property
+    def _fields(self) -> FloatArray:
+        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+
+    def _local(self, share: float) -> FloatArray | None:
+        """Return local fields (n, k, V, 3) that have a share of the variance, if there are any."""
+        return scale_of(self._fields, self.rows, share) * self._fields if share else None
+
+    @abstractmethod
+    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
+        """Return the shapes nearest to the shapes (k, V, 3) of the fold, with a number of modes and a share of local
+        fields.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class _LinesPart(_Part):
+    lines: StraightLines
+    offsets: FloatArray  # (n, q) of the other shapes
+
+    @classmethod
+    def of(cls, kind: StraightKind, shapes: FloatArray, reference: TriangleMesh) -> _LinesPart:
+        lines = StraightLines.of(kind, shapes, reference, norm="vertices")
+        offsets = lines.offsets(shapes)
+        return cls(lines.reference, lines.moved(offsets).reshape(len(shapes), -1), lines, offsets)
+
+    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
+        return self.lines.along(self.offsets, self._local(share)).first(count).nearest(shapes).vertices
+
+
+@dataclass(frozen=True, eq=False)
+class _ExponentialsPart(_Part):
+    space: ShellSpace
+    fields: FloatArray  # (n, V, 3) logarithms of the other shapes
+    towards: FloatArray  # (k, V, 3) logarithms of the shapes of the fold
+    steps: int
+
+    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
+        mean, local = self.mean.vertices, self._local(share)
+        return nearest_exponentials(self.space, mean, self.fields, self.towards, shapes, count, self.steps, local)
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """A map of all shapes, and the map without some of those that are compared."""
 
     kind: Kind
     own: ModeCount
-    mean: TriangleMesh
-    shapes: FloatArray  # (n, V, 3) shapes that are compared
-    rows: FloatArray  # (n, 3V) motions of vertices from the mean to them
-
-    @cached_property
-    def _local(self) -> FloatArray:
-        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
-
-    def nearest(self, kept: IntArray, index: IntArray, count: int, share: float) -> FloatArray:
-        """Return the shapes (k, V, 3) nearest to shapes ``index``, with a number of modes of the shapes ``kept``.
-
-        Local fields of these have a ``share`` of the variance.
-        """
-        local = None
-        if share:
-            local = self._local[kept]
-            local = scale_of(local, self.rows[kept], share) * local
-        return self._nearest(kept, index, count, local)
-
-    @abstractmethod
-    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
-        """Return the shapes (k, V, 3), with local fields (n, k, V, 3) as they are."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Lines(_Map):
-    lines: StraightLines
-    offsets: FloatArray  # (n, q)
-
-    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
-        return self.lines.along(self.offsets[kept], local).first(count).nearest(self.shapes[index]).vertices
-
-
-@dataclass(frozen=True, eq=False)
-class _Exponentials(_Map):
-    space: ShellSpace
-    fields: FloatArray  # (n, V, 3) logarithms
-    steps: int
-
-    def _nearest(self, kept: IntArray, index: IntArray, count: int, local: FloatArray | None) -> FloatArray:
-        mean, fields = self.mean.vertices, self.fields[kept]
-        if local is not None:
-            fields = np.concatenate([fields, local.reshape(-1, *mean.shape)])
-        modes = pga(self.space, mean, fields, count, "vertices").vertices
-        start, _ = coefficients(self.space, mean, self.fields[index], modes, "vertices")
-        return nearest_codes(self.space, mean, modes, self.shapes[index], start, self.steps).vertices
+    rows: FloatArray  # (n, 3V) motions of vertices from the mean to the shapes that are compared
+    without: Callable[[IntArray, IntArray], _Part]  # from indices of the shapes that are kept, and of the others
+    lines: StraightLines | None = None
 
 
 class _Comparison:
@@ -257,6 +262,7 @@ class _Comparison:
         self._steps, self._first_step = _many(settings, first_step), first_step
         self._light = min(LIGHT_STEPS, self._steps)
         self._folds = folds(int(self._own.max()) + 1)
+        self._parts: dict[tuple[Kind, int], _Part] = {}
         self._measured: dict[tuple[Kind, int, int, float], FloatArray] = {}
 
     def choice(self) -> GeometryChoice:
@@ -270,8 +276,8 @@ class _Comparison:
         supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in self._folds)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
         counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
-        vertices = maps.get("vertices")
-        folded = self._folded(vertices.lines.first(min(count, FOLDED_MODES))) if isinstance(vertices, _Lines) else 0.0
+        straight = maps["vertices"].lines if "vertices" in maps else None
+        folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
         kind, errors, held_out = cheapest({}, folded), dict[Kind, float](), 0
         for fold, index in enumerate(self._folds):
@@ -308,14 +314,21 @@ class _Comparison:
             # They must reach enough shapes.
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
             own, (space, mean, fields) = mode_count(self._settings, *at, self._own), at
-            centre, rows = self._reference.with_vertices(mean), fields.reshape(len(fields), -1)
-            return _Exponentials(kind, own, centre, self._some, rows, space, fields, self._light)
+            centre = self._reference.with_vertices(mean)
+
+            def exponentials(kept: IntArray, index: IntArray) -> _Part:
+                rows = (fields[kept] - fields[kept].mean(axis=0)).reshape(len(kept), -1)
+                return _ExponentialsPart(centre, rows, space, fields[kept], fields[index], self._light)
+
+            return _Map(kind, own, fields.reshape(len(fields), -1), exponentials)
+
+        def straight(kept: IntArray, _: IntArray) -> _Part:
+            return _LinesPart.of(kind, self._some[kept], self._reference)
+
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)
         own = straight_count(self._settings, lines, self._shapes, self._original_index)
-        offsets = lines.offsets(self._some)
-        rows = lines.moved(offsets).reshape(len(offsets), -1)
-        return _Lines(kind, own, lines.reference, self._some, rows, lines, offsets)
+        return _Map(kind, own, lines.motions(self._some), straight, lines)
 
     def _chosen(self, chosen: _Map) -> GeometryChoice:
         """Return the choice of a map, with the share of local fields in its modes."""
@@ -335,15 +348,16 @@ class _Comparison:
         try:
             for share in LOCAL_SHARES:
                 ours, theirs = self._compared(chosen, share, best)
-                if ours >= theirs:
+                if _certainly_positive(ours - theirs):
                     break
-                best, gain = share, 1 - (1 - gain) * ours / theirs
+                if ours.mean() < theirs.mean():
+                    best, gain = share, 1 - (1 - gain) * float(ours.mean() / theirs.mean())
         except (ModeError, NotPositiveDefiniteError):  # the map fails without some of the shapes
             return 0.0, 0.0
         return best, gain
 
-    def _compared(self, chosen: _Map, share: float, other: float) -> tuple[float, float]:
-        """Return the mean distances of held-out shapes with two shares of local fields.
+    def _compared(self, chosen: _Map, share: float, other: float) -> tuple[FloatArray, FloatArray]:
+        """Return distances (n,) of held-out shapes with two shares of local fields.
 
         Folds end once it is certain which is smaller.
         """
@@ -355,15 +369,17 @@ class _Comparison:
             gaps = away[:, 0] - away[:, 1]
             if len(away) >= ENOUGH and (_certainly_positive(gaps) or _certainly_positive(-gaps)):
                 break
-        ours, theirs = away.mean(axis=0).tolist()
-        return ours, theirs
+        return away[:, 0], away[:, 1]
 
     def _distances(self, chosen: _Map, fold: int, count: int, share: float = 0.0) -> FloatArray:
         """Return distances (k,) of the shapes of a fold from the nearest shapes of a map."""
         key = chosen.kind, fold, count, share
         if key not in self._measured:
             index = self._folds[fold]
-            near = chosen.nearest(np.flatnonzero(~np.isin(self._own, index)), index, count, share)
+            if (chosen.kind, fold) not in self._parts:
+                kept = np.flatnonzero(~np.isin(self._own, index))
+                self._parts[chosen.kind, fold] = chosen.without(kept, index)
+            near = self._parts[chosen.kind, fold].nearest(self._some[index], count, share)
             self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
         return self._measured[key]
 

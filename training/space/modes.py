@@ -173,24 +173,41 @@ def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: i
     """
     most = most_modes(len(left), original_index) if most is None else most
     errors = np.sqrt(left)[:, : 1 + most].mean(axis=0)
-    return max(1, int(np.argmin(errors / errors[0] + WORTH * np.arange(len(errors)))))
+    return max(1, int(np.argmin(errors + WORTH * errors[0] * np.arange(len(errors)))))
 
 
 def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -> FloatArray:
     """Return square errors (n, n) of held-out vectors for 0, 1, 2 … principal modes of the other vectors.
 
-    ``gram`` (n, n) has the inner products of the vectors. Rows of local fields are 0.
+    ``gram`` (n, n) has the inner products of the vectors. All are taken from the mean of the other vectors. Rows of
+    local fields are 0.
     """
     n = len(gram)
     original_index = np.arange(n) if original_index is None else original_index
     left = np.zeros((n, n))
     for held, kept in inner_folds(original_index):
-        values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)])
+        about = about_mean_of(kept, about_mean_of(kept, gram, original_index).T, original_index)
+        values, vectors = np.linalg.eigh(about[np.ix_(kept, kept)])
         some = np.flatnonzero(values > NEGLIGIBLE * gram.trace())[::-1]
         along = np.zeros((len(held), n))
-        along[:, 1 : 1 + len(some)] = (gram[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
-        left[held] = np.maximum(gram[held, held][:, None] - np.cumsum(along, axis=1), 0)
+        along[:, 1 : 1 + len(some)] = (about[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
+        left[held] = np.maximum(about[held, held][:, None] - np.cumsum(along, axis=1), 0)
     return left
+
+
+def about_mean_of(kept: IntArray, rows: FloatArray, original_index: IntArray) -> FloatArray:
+    """Return rows (n, …) about the mean of those ``kept``, so that they show nothing of the others.
+
+    ``original_index`` (n,) is as for `inner_folds`. Local fields have the local fields of this mean as theirs.
+    """
+    local = np.flatnonzero(original_index < 0)
+    own = len(rows) - len(local)
+    number = np.zeros(len(rows), dtype=int)
+    number[local] = 1 + np.arange(len(local)) % max(1, len(local) // own)  # of the window
+    found = rows.copy()
+    for each in np.unique(number[kept]):
+        found[number == each] -= rows[kept[number[kept] == each]].mean(axis=0)
+    return found
 
 
 def inner_folds(original_index: IntArray) -> list[tuple[IntArray, IntArray]]:

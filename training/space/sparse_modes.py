@@ -48,6 +48,7 @@ from shapespace.training.space.modes import (
     ModeProblem,
     Modes,
     Norm,
+    about_mean_of,
     coefficients,
     inner_folds,
     localisation,
@@ -232,9 +233,10 @@ def _chosen_sparsity(
     originals = int(original_index.max()) + 1
     folds = inner_folds(original_index) if originals > 1 else []
     enough = -(-HELD_OUT * len(folds) // originals)
-    trials = [
-        _Trial(space, mean, fields[kept], fields[held], min(count, len(kept)), norm) for held, kept in folds[:enough]
-    ]
+    trials = []
+    for held, kept in folds[:enough]:
+        about = about_mean_of(kept, fields, original_index)
+        trials.append(_Trial(space, mean, about[kept], about[held], min(count, len(kept)), norm))
     if not trials:
         return 0.0
     least = float(np.concatenate([trial.least for trial in trials]).mean())

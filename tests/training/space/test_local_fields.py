@@ -32,9 +32,9 @@ KNOWN = 8
 
 @pytest.fixture(scope="module")
 def waves(ellipsoid: TriangleMesh) -> FloatArray:
-    """Eight shapes and eight others (n, V, 3), each moved by waves of its own."""
+    """Eight shapes and eight others (n, V, 3), each moved by long waves of its own."""
     rng, x = np.random.default_rng(3), ellipsoid.vertices
-    moved = [np.sin(1.5 * x @ rng.standard_normal((3, 3)) + rng.uniform(0, 6, 3)) for _ in range(2 * KNOWN)]
+    moved = [np.sin(0.5 * x @ rng.standard_normal((3, 3)) + rng.uniform(0, 6, 3)) for _ in range(2 * KNOWN)]
     return x + 0.08 * np.stack(moved)
 
 
