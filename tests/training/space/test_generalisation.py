@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
+from shapespace.mesh.rigid_motion import without_rigid_motion
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.shell.energy import Material
+from shapespace.shell.space import ShellSpace
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import box_of
 from shapespace.training.space.generalisation import (
     PrincipalComponents,
     folds,
+    nearest_exponentials,
     summary,
     time_steps,
     to_nearest,
@@ -44,6 +47,25 @@ def test_nothing_is_known_of_what_is_held_out(ellipsoid, shapes):
     # The start of the search depends on both held-out shapes, its end hardly.
     assert found.near["modes"][0][0] == pytest.approx(again.near["modes"][0][0], abs=1e-4)
     assert found.near["components"][0][0] == pytest.approx(again.near["components"][0][0], abs=1e-12)
+
+
+def test_modes_lead_from_the_mean_of_the_other_logarithms(ellipsoid):
+    """The logarithms at the mean of all shapes add up to zero, so that the others' sum would give the last one away."""
+    rng, x = np.random.default_rng(0), ellipsoid.vertices
+    waves = np.stack([np.sin(x @ rng.standard_normal((3, 3)) + rng.uniform(0, 6, 3)) for _ in range(4)])
+    others = 0.05 * without_rigid_motion(waves, x)
+    last = -others.sum(axis=0)
+    mixed = np.tensordot([0.7, 0.5, -0.4, 0.2], others, axes=1)  # with weights that add up to 1
+    towards = np.stack([last, mixed])
+    space = ShellSpace(ellipsoid, Material(), first_step="centred")
+    near = nearest_exponentials(space, x, others, towards, x + towards, 3, 1)
+    away = vertex_distances(near, x + towards, ellipsoid.diagonal).mean(axis=1)
+    assert away[1] < 1e-4
+    edges = others[1:] - others[0]
+    known = edges.reshape(3, -1).T
+    rest = (last - others[0]).ravel()
+    rest = rest - known @ np.linalg.lstsq(known, rest)[0]
+    assert away[0] == pytest.approx(np.linalg.norm(rest.reshape(-1, 3), axis=1).mean() / ellipsoid.diagonal, rel=0.05)
 
 
 def test_one_step_is_chosen_where_shapes_neither_bend_nor_fold(ellipsoid, shapes, blends):

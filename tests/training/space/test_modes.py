@@ -20,7 +20,16 @@ from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space import logarithms as search
 from shapespace.training.space import sparse_modes
 from shapespace.training.space.logarithms import logarithms
-from shapespace.training.space.modes import ModeError, Modes, Norm, localisation, mode_count, pga
+from shapespace.training.space.modes import (
+    ModeError,
+    Modes,
+    Norm,
+    inner_folds,
+    left_of_held_out,
+    localisation,
+    mode_count,
+    pga,
+)
 from shapespace.training.space.sparse_modes import _fit_in_box, spga
 from tests.shapespace.conftest import bent
 
@@ -436,3 +445,18 @@ def test_a_shape_and_its_mirror_image_are_held_out_together(mixed: Bumps) -> Non
     once = mode_count(ModeSettings(), mixed.space, mixed.mean, noisy).count
     assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice, whose).count == once
     assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice).count > once
+
+
+@pytest.mark.parametrize("origin", [0.0, 3.0, None])
+def test_inner_folds_know_nothing_of_what_is_held_out(origin: float | None) -> None:
+    """Wherever the origin lies, errors are those of principal components about the mean of the other rows."""
+    rows = np.random.default_rng(0).standard_normal((12, 30)) + 1
+    about = rows - (rows.mean(axis=0) if origin is None else origin)
+    left = left_of_held_out(about @ about.T)
+    for held, kept in inner_folds(np.arange(len(rows))):
+        mean = rows[kept].mean(axis=0)
+        components = np.linalg.svd(rows[kept] - mean, full_matrices=False)[2]
+        for count in (0, 1, 3, len(kept) - 1):
+            away = rows[held] - mean
+            away = away - away @ components[:count].T @ components[:count]
+            assert left[held, count] == pytest.approx((away**2).sum(axis=1))
