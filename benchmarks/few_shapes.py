@@ -27,6 +27,8 @@ FIGURES = ROOT / "runs" / "few-shapes.json"
 NAMES = ("hand", "figure", "makehuman", "samba", "faces", "hippocampus")
 #: Numbers of training shapes, and how often they are drawn: chance matters most with few.
 DRAWS = {5: 3, 10: 2, 20: 1, 40: 1, 80: 1}
+#: The fewest shapes, in words.
+FEWEST = {5: "five", 10: "ten"}
 #: Number of shapes that are never drawn.
 UNSEEN = 12
 #: Keys of all models; the first is ours.
@@ -49,7 +51,7 @@ models](generalisation.md#stronger-simple-models). Empty cells: there are too fe
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Look at the sliders.** {counts} Those beyond nine come from [local fields](../explanation/choosing.md#few-shapes):
+- **Look at the sliders.** {counts} The last ones come from [local fields](../explanation/choosing.md#few-shapes):
   they move single regions. They can fit an unseen shape, but none of your shapes shows them as a whole.{rises}
 
 ## How it was measured
@@ -148,15 +150,25 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
             doublings = np.log2(counts[-1] / counts[0])
             falls[name] = 100 * (1 - (last / first) ** (1 / doublings))
     said = f"Each doubling of the shapes lowers the error on unseen shapes by {between(falls, '{:.0f} %')} on average."
-    ten = {key[0]: row for key, row in found.items() if key[1] == 10}
-    if ten:
-        ratios = {name: row["modes"] / row["components"] for name, row in ten.items()}
-        worst = max(row["modes"] / simplest(row)[1] for row in ten.values())
-        said += (
-            f"\n\nWith ten shapes, our error is {between(ratios, '{:.2f}')} of the error of principal components."
-            f"\nIt is at most {worst:.2f} of the error of the best simple model."
-        )
+    for number, word in FEWEST.items():
+        rows = {key[0]: row for key, row in found.items() if key[1] == number}
+        if rows:
+            ratios = {name: row["modes"] / row["components"] for name, row in rows.items()}
+            worst = max(row["modes"] / simplest(row)[1] for row in rows.values())
+            said += (
+                f"\n\nWith {word} shapes, our error is {between(ratios, '{:.2f}')} of the error of principal components."
+                f"\nIt is at most {worst:.2f} of the error of the best simple model."
+            )
     return said
+
+
+def sliders(found: dict[tuple[str, int], dict[str, Any]]) -> str:
+    """Say how many modes a few shapes have."""
+    said = []
+    for number, word in FEWEST.items():
+        counts = [count for key, row in found.items() if key[1] == number for count in row["counts"]]
+        said.append(f"{min(counts):.0f} to {max(counts):.0f} modes from {word} shapes")
+    return f"Training takes {' and '.join(said)}."
 
 
 def rises(found: dict[tuple[str, int], dict[str, Any]]) -> Iterable[str]:
@@ -184,7 +196,6 @@ def write_page() -> None:
         [name, *(cell(found[name, count]) if (name, count) in found else "" for count in counts)] for name in NAMES
     ]
     largest = [f"With {most} shapes, {name} has {cell(row)}." for (name, count), row in found.items() if count == most]
-    ten = [count for key, row in found.items() if key[1] == 10 for count in row["counts"]]
     draw_chart(found, pages.MEASUREMENTS / "few-shapes.svg")
     draws = ", ".join(f"{count} shapes {'once' if times == 1 else f'{times} times'}" for count, times in DRAWS.items())
     page = PAGE.format(
@@ -192,7 +203,7 @@ def write_page() -> None:
         table=table(("", *(f"{count} shapes" for count in counts)), cells),
         largest=" ".join(largest),
         rises="".join(rises(found)),
-        counts=f"From ten shapes, training takes {min(ten):.0f} to {max(ten):.0f} modes.",
+        counts=sliders(found),
         unseen=UNSEEN,
         draws=draws,
         measured=pages.measured_with(FIGURES),

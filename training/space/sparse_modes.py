@@ -44,6 +44,7 @@ from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.local_fields import local_fields, scale_of
 from shapespace.training.space.modes import (
+    INNER_FOLDS,
     NEGLIGIBLE,
     ModeProblem,
     Modes,
@@ -235,7 +236,8 @@ def _chosen_sparsity(
     enough = -(-HELD_OUT * len(folds) // originals)
     trials = []
     for held, kept in folds[:enough]:
-        about = about_mean_of(kept, fields, original_index)
+        # About their own mean, fewer shapes would have too few modes to tell.
+        about = about_mean_of(kept, fields, original_index) if originals >= INNER_FOLDS else fields
         trials.append(_Trial(space, mean, about[kept], about[held], min(count, len(kept)), norm))
     if not trials:
         return 0.0
