@@ -155,8 +155,9 @@ def finding(found: dict[tuple[str, int], dict[str, Any]]) -> str:
         if rows:
             ratios = {name: row["modes"] / row["components"] for name, row in rows.items()}
             worst = max(row["modes"] / simplest(row)[1] for row in rows.values())
+            share = between(ratios, "{:.2f}")
             said += (
-                f"\n\nWith {word} shapes, our error is {between(ratios, '{:.2f}')} of the error of principal components."
+                f"\n\nWith {word} shapes, our error is {share} of the error of principal components."
                 f"\nIt is at most {worst:.2f} of the error of the best simple model."
             )
     return said
