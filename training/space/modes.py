@@ -45,6 +45,8 @@ NEGLIGIBLE = 1e-9
 LOCALISED_PART = 0.95
 #: Number of inner folds by which the number of modes is chosen, each held out in its turn.
 INNER_FOLDS = 5
+#: Fewest shapes with local fields: without one of them, two others still show a direction.
+FEWEST = 3
 #: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
 WORTH = 0.005
 
@@ -140,7 +142,7 @@ def worthwhile_with_local(
     original_index = np.arange(n) if original_index is None else original_index
     left = left_of_held_out(rows @ rows.T, original_index)
     count, most = worthwhile(left, original_index), most_modes(n, original_index)
-    if count < most or int(original_index.max()) + 1 < INNER_FOLDS:
+    if count < most or int(original_index.max()) + 1 < FEWEST:
         return ModeCount(count, count)
     unseen = unseen_share(left, original_index)
     share = LOCAL_SHARE * unseen
