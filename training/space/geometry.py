@@ -36,6 +36,7 @@ from shapespace.training.space.generalisation import (
 )
 from shapespace.training.space.local_fields import LocalVariation, local_fields, scale_of
 from shapespace.training.space.modes import (
+    FEWEST,
     ModeCount,
     ModeError,
     left_of_held_out,
@@ -130,7 +131,7 @@ def choose_geometry(
         return GeometryChoice("exponential", steps)
     if settings.geometry != "auto":
         among = (settings.geometry,)
-    few = original_index.max() + 1 < FOLDS  # too few to compare exponentials
+    few = original_index.max() + 1 < FEWEST  # too few to compare exponentials
     if "exponential" in among and (few or (len(among) == 1 and not vary)):
         return GeometryChoice("exponential", _many(settings, first_step))
     comparison = _Comparison(settings, reference, shapes, material, original_index, first_step, among, vary)

@@ -45,7 +45,7 @@ NEGLIGIBLE = 1e-9
 LOCALISED_PART = 0.95
 #: Number of inner folds by which the number of modes is chosen, each held out in its turn.
 INNER_FOLDS = 5
-#: Fewest shapes with local fields: without one of them, two others still show a direction.
+#: Fewest shapes that can be held out: without one of them, two others still show a direction.
 FEWEST = 3
 #: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
 WORTH = 0.005

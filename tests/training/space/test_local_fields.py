@@ -111,9 +111,8 @@ def limbs() -> tuple[TriangleMesh, FloatArray]:
     """Limbs that move by themselves, in 32 poses (n, V, 3): a few show how they move, but not in all combinations."""
     poses = figure.pose(np.random.default_rng(0).uniform(-0.6, 0.6, (32, len(figure.ANGLES))))
     coarse = coarsen(figure.rest(), 400, poses[:4])
-    return TriangleMesh.from_arrays(figure.rest().vertices[coarse.fine_index], coarse.faces), poses[
-        :, coarse.fine_index
-    ]
+    rest = TriangleMesh.from_arrays(figure.rest().vertices[coarse.fine_index], coarse.faces)
+    return rest, poses[:, coarse.fine_index]
 
 
 def test_three_shapes_have_local_fields(limbs: tuple[TriangleMesh, FloatArray]) -> None:
