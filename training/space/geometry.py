@@ -44,7 +44,7 @@ from shapespace.training.space.modes import (
     unseen_share,
     worthwhile_with_local,
 )
-from shapespace.training.space.straight_lines import StraightKind, StraightLines
+from shapespace.training.space.straight_lines import StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
 #: All maps, the cheapest first.
@@ -187,15 +187,19 @@ class _Part(ABC):
     """A map that knows nothing of the shapes of a fold."""
 
     mean: TriangleMesh
-    rows: FloatArray  # (n, 3V) motions of vertices from the mean to the other shapes
+
+    @cached_property
+    @abstractmethod
+    def _motions(self) -> FloatArray:
+        """Motions (n, V, 3) of vertices from the mean to the other shapes."""
 
     @cached_property
     def _fields(self) -> FloatArray:
-        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+        return local_fields(self.mean, self._motions)
 
-    def _local(self, share: float) -> FloatArray | None:
-        """Return local fields (n, k, V, 3) that have a share of the variance, if there are any."""
-        return scale_of(self._fields, self.rows, share) * self._fields if share else None
+    def _local(self, share: float) -> FloatArray:
+        """Return local fields (n, k, V, 3) that have a share of the variance."""
+        return scale_of(self._fields, self._motions, share) * self._fields
 
     @abstractmethod
     def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
@@ -206,17 +210,20 @@ class _Part(ABC):
 
 @dataclass(frozen=True, eq=False)
 class _LinesPart(_Part):
-    lines: StraightLines
-    offsets: FloatArray  # (n, q) of the other shapes
+    lines: StraightLines  # of the other shapes
+    others: FloatArray  # (n, V, 3)
 
-    @classmethod
-    def of(cls, kind: StraightKind, shapes: FloatArray, reference: TriangleMesh) -> _LinesPart:
-        lines = StraightLines.of(kind, shapes, reference, norm="vertices")
-        offsets = lines.offsets(shapes)
-        return cls(lines.reference, lines.moved(offsets).reshape(len(shapes), -1), lines, offsets)
+    @cached_property
+    def _offsets(self) -> FloatArray:
+        return self.lines.offsets(self.others)
+
+    @cached_property
+    def _motions(self) -> FloatArray:
+        return self.lines.moved(self._offsets)
 
     def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
-        return self.lines.along(self.offsets, self._local(share)).first(count).nearest(shapes).vertices
+        lines = self.lines.along(self._offsets, self._local(share)) if share else self.lines
+        return lines.first(count).nearest(shapes).vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +233,12 @@ class _ExponentialsPart(_Part):
     towards: FloatArray  # (k, V, 3) logarithms of the shapes of the fold
     steps: int
 
+    @cached_property
+    def _motions(self) -> FloatArray:
+        return self.fields - self.fields.mean(axis=0)
+
     def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
-        mean, local = self.mean.vertices, self._local(share)
+        mean, local = self.mean.vertices, self._local(share) if share else None
         return nearest_exponentials(self.space, mean, self.fields, self.towards, shapes, count, self.steps, local)
 
 
@@ -318,13 +329,14 @@ class _Comparison:
             centre = self._reference.with_vertices(mean)
 
             def exponentials(kept: IntArray, index: IntArray) -> _Part:
-                rows = (fields[kept] - fields[kept].mean(axis=0)).reshape(len(kept), -1)
-                return _ExponentialsPart(centre, rows, space, fields[kept], fields[index], self._light)
+                return _ExponentialsPart(centre, space, fields[kept], fields[index], self._light)
 
             return _Map(kind, own, fields.reshape(len(fields), -1), exponentials)
 
         def straight(kept: IntArray, _: IntArray) -> _Part:
-            return _LinesPart.of(kind, self._some[kept], self._reference)
+            others = self._some[kept]
+            found = StraightLines.of(kind, others, self._reference, norm="vertices")
+            return _LinesPart(found.reference, found, others)
 
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)

@@ -88,11 +88,10 @@ class StraightLines:
         norm: LineNorm = "coordinates",
         share: float = 0.0,
     ) -> StraightLines:
-        """Find the mean of shapes (n, V, 3) in any position, and all their principal modes, see `along`. In
-        the norm of vertices, local fields may add a ``share`` of the variance.
+        """Find the mean of shapes (n, V, 3) in any position, and all their principal modes, see `along`.
 
         In the norm of vertices, a vertex counts as many times as ``vertex_counts`` (V,) says, by default once. So a
-        simplified mesh has nearly the modes of the fine mesh.
+        simplified mesh has nearly the modes of the fine mesh. Local fields may add a ``share`` of the variance there.
 
         Raises ModeError if the shapes have no such mean, or are all the same.
         """
