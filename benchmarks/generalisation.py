@@ -15,11 +15,12 @@ import numpy as np
 from benchmarks import pages
 from benchmarks.pages import ROOT
 from benchmarks.results import COLLECTIONS, MANNEQUIN, MIRRORED, PEOPLE, SYMMETRIC, open_run
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.directory import RunDirectory
-from shapespace.training.space.generalisation import FOLDS, LIGHT_STEPS, folds, summary
+from shapespace.training.space.generalisation import LIGHT_STEPS, summary
 from shapespace.training.space.held_out import held_out
+from shapespace.training.space.related import FOLDS, Related
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
 
@@ -115,15 +116,15 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     """Return figures of a collection by number of coordinates, over all shapes, each from the fold that held it out."""
     opened = ingested(name, data, out)
     run, config = opened.directory, opened.config
-    reference, shapes, original, own = read_shapes(run)
+    reference, shapes, related = read_shapes(run)
     m = config.modes.count
     counts = None if m == "auto" else [-(-m // 2), m]
     every = []
-    for k, index in enumerate(folds(len(own))):
+    for k, index in enumerate(related.folds()):
         file = run.study(f"fold-{k}")
         if not file.exists():
             material = config.shell_material
-            found = held_out(reference, shapes, index, counts, config.modes, material, original=original)
+            found = held_out(reference, shapes, index, counts, config.modes, material, related=related)
             away = found.distances(shapes, reference.diagonal)
             file.write(
                 {"counts": found.counts, "steps": int(found.steps[0])}
@@ -133,7 +134,7 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
             print(name, k, means, flush=True)
         every.append(file.read())
     return {
-        "shapes": len(own),
+        "shapes": related.originals,
         "counts": every[0]["counts"],
         "steps": sorted({fold["steps"] for fold in every}),
         **{
@@ -144,17 +145,17 @@ def measure(name: str, data: Path, out: Path) -> dict[str, Any]:
     }
 
 
-def read_shapes(run: RunDirectory) -> tuple[TriangleMesh, FloatArray, IntArray, FloatArray]:
-    """Read the reference, all shapes (n, V, 3), the index (n,) of each shape's original, and the originals."""
+def read_shapes(run: RunDirectory) -> tuple[TriangleMesh, FloatArray, Related]:
+    """Read the reference, all shapes (n, V, 3), and which are related."""
     given = run.shapes.read()
-    return run.reference_mesh(), given["vertices"], given["original"], run.own_shapes()
+    return run.reference_mesh(), given["vertices"], Related.of_arrays(given)
 
 
 def measure_people(data: Path, out: Path) -> dict[str, Any]:
     """Return figures of a run's own choice of map and modes, and of simple models, for unseen poses and persons."""
     opened = ingested(PEOPLE, data, out)
     run, config = opened.directory, opened.config
-    reference, shapes, _, _ = read_shapes(run)
+    reference, shapes, _ = read_shapes(run)
     # "person 3, pose 2" is 3, 2
     numbers = np.array([[int(part.split()[1]) for part in name.split(", ")] for name in run.shapes.read()["names"]])
     settings = config.modes.model_copy(update={"geometry": "auto"})

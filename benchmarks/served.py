@@ -25,15 +25,14 @@ from shapespace.mesh.triangle_mesh import TriangleMesh, diagonal
 from shapespace.model.shape_model import ShapeModel, load
 from shapespace.training.runs.config import parse
 from shapespace.training.space.generalisation import (
-    FOLDS,
     RANDOM,
     PrincipalComponents,
-    folds,
     summary,
     to_nearest,
     vertex_distances,
 )
 from shapespace.training.space.held_out import simple_models
+from shapespace.training.space.related import FOLDS, Related
 from shapespace.training.stages.export import write_bundle_of
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run, read_meshes
@@ -113,7 +112,7 @@ def four_fifths(name: str, data: Path, out: Path, fold: int = 0) -> tuple[Run, F
     """
     example = open_run(name.removesuffix(HALF), data, out)
     meshes = read_meshes(example.config)
-    held = folds(len(meshes.names))[fold]
+    held = Related.none(len(meshes.names)).folds()[fold]
     known, names = (np.delete(array, held, axis=0) for array in (meshes.vertices, np.array(meshes.names)))
     ending = f"-fold-{fold}" if fold else ""
     file = out / "data" / f"{name.removesuffix(HALF)}{ending}.npz"

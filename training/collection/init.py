@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shapespace.files.limits import in_words
+from shapespace.training.collection.groups import SUBJECT, subjects_repeat
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.mesh_collection import MeshCollection
 from shapespace.training.runs.config import ConfigError
@@ -33,6 +34,7 @@ data = {data}    # folder of meshes, one NPZ, or one GLB with morph targets; rel
 # shape. To choose another shape: reference = {other}
 {coarse}{parts}
 # mirror = true    # if one shape is symmetric, learn from the mirror images of all shapes too
+{related}
 
 [material]
 # eta = {material.eta:g}    # resistance to bending against stretching; with large values, triangles may collapse
@@ -99,6 +101,7 @@ def configuration(
         data=_string(data),
         reference=_string(collection.names[collection.central]),
         other=_string(collection.names[0]),
+        related=_related(collection.names),
         coarse=coarse,
         parts=_parts(collection, parts),
         file=f"file = {_string(file)}    # file to read from each folder in data, which names the shape\n"
@@ -115,6 +118,14 @@ def configuration(
         title=_string(title),
         description=_string(f"Learned from {count} shapes."),
     )
+
+
+def _related(names: Sequence[str]) -> str:
+    """Return the setting ``related`` where subjects have several shapes, or else how to set it."""
+    setting = f"related = '{SUBJECT}'"
+    if subjects_repeat(names):
+        return f"{setting}    # scans of the same subject are left out together to measure errors"
+    return f"# Several scans of a patient are related. To leave them out together where errors are measured: {setting}"
 
 
 def _parts(collection: MeshCollection, chosen: Sequence[str]) -> str:

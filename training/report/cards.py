@@ -152,8 +152,9 @@ def accuracy_cards(record: Record, studio: Studio | None) -> list[dict[str, Any]
     cards = []
     if (facts := record.generalisation) and "failed" not in facts:
         how = (
-            f"{counted(facts['held_out'], 'shape')}, left out when map, mean and modes were chosen. Measured with "
-            "exact shapes instead of networks"
+            f"{counted(facts['held_out'], 'shape')}, left out when map, mean and modes were chosen"
+            f"{', with all shapes related to them' if 'groups' in facts else ''}. Measured with exact shapes instead "
+            "of networks"
         )
         if facts.get("stuck"):
             how += f". The search for {counted(facts['stuck'], 'shape')} failed because faces collapse"

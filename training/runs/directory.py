@@ -176,7 +176,8 @@ class RunDirectory:
     """Prolongation from the coarse mesh to the fine mesh, where the meshes are finer; see Prolongation.arrays."""
     shapes = RunFile(NpzFile, "shapes.npz")
     """``names (n)``, normalised ``vertices (n, V, 3)``, ``files (n)``, ``first (n)`` vertex number of each file.
-    Mirror images come last. ``original (n)`` is the index of the original, or of the shape itself."""
+    Mirror images come last. ``original (n)`` is the index of the original, or of the shape itself. With
+    ``collection.related``, ``group (originals)`` says which originals are related."""
     ingest = RunFile(JsonFile, "ingest.json")
     """Notes and warnings on the collection, and facts about the coarse mesh."""
     surface = RunFile(NpzFile, "surface.npz")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -45,10 +46,18 @@ class SettingsTable(BaseModel):
         return {name: value for name, value in dump(self).items() if name not in usual}
 
 
+def _expression(text: str) -> str:
+    try:
+        re.compile(text)
+    except re.error as error:
+        raise ValueError(f"is no regular expression: {error}") from None
+    return text
+
+
 class CollectionSettings(SettingsTable):
     """The shapes: a built-in generator, or meshes in correspondence."""
 
-    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file"})
+    SINCE_0_3: ClassVar[frozenset[str]] = frozenset({"file", "related"})
 
     generator: Literal["freaky-torus", "figure", "expressive", "people"] | None = None
     """Built-in generator, instead of ``data``. ``expressive``, a body with hands and face, and ``people``, 24 bodies in
@@ -66,6 +75,10 @@ class CollectionSettings(SettingsTable):
     """Vertices to compute with. Meshes with more than 1.5 times as many are simplified; 0 computes with all."""
     mirror: bool = True
     """Also learn from [mirror images](glossary.md#mirror-image), if one shape has exactly one plane of symmetry."""
+    related: Annotated[str, AfterValidator(_expression)] | None = None
+    """The part of names that [related shapes](../explanation/choosing.md#related-shapes) share, such as ``sub-[0-9]+``
+    for several scans of a patient: a [regular expression](https://docs.python.org/3/library/re.html). To measure errors
+    on unseen shapes, they are left out together."""
 
     @model_validator(mode="after")
     def _one_source(self) -> CollectionSettings:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.coordinates.nric import dihedral_angles
 from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
@@ -24,9 +24,8 @@ from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, pga
+from shapespace.training.space.related import FOLDS, Related
 
-#: Number of folds. Below twice this number of shapes, each shape is held out by itself.
-FOLDS = 5
 #: Default steps K of logarithms and exponentials with the paper's first step.
 STEPS = 16
 #: Default steps K of logarithms with a centred first step, and most steps where spaces are compared.
@@ -94,12 +93,6 @@ def summary(distances: FloatArray) -> dict[str, float]:
     return {"mean": float(distances.mean()), f"p{PERCENTILE}": float(np.percentile(distances, PERCENTILE))}
 
 
-def folds(count: int) -> list[IntArray]:
-    """Return the indices of the shapes that are held out together, for each fold."""
-    parts = FOLDS if count >= 2 * FOLDS else count
-    return [np.arange(fold, count, parts) for fold in range(parts)]
-
-
 def many_steps(first_step: FirstStep) -> int:
     """Return K of exponentials that bend, where the settings leave it open."""
     return LIGHT_STEPS if first_step == "centred" else STEPS
@@ -110,7 +103,7 @@ def time_steps(
     reference: TriangleMesh,
     shapes: FloatArray,
     material: Material,
-    original_index: IntArray | None = None,
+    related: Related | None = None,
     first_step: FirstStep = "centred",
 ) -> int:
     """Return K of logarithms, from the settings or by cross-validation.
@@ -121,24 +114,23 @@ def time_steps(
     `nearest_exponentials`.
 
     The settings ``log_steps`` and ``count`` matter. At most `CHOICE_SHAPES` shapes (n, V, 3), spread evenly, are held
-    out. ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last.
+    out, those that are ``related`` together.
     """
     if settings.log_steps != "auto":
         return settings.log_steps
     many = many_steps(first_step)
-    original_index = np.arange(len(shapes)) if original_index is None else original_index
-    count = int(original_index.max()) + 1
-    if count < FOLDS:  # too few to choose
+    related = related or Related.none(len(shapes))
+    if related.groups < FOLDS:  # too few to choose
         return many
-    used = original_index % -(-count // CHOICE_SHAPES) == 0
+    used = related.spread(CHOICE_SHAPES)
     try:
         if _folded(reference, shapes, material, first_step) > FOLDED_SHARE:
             return many
-        original_index, shapes = np.unique(original_index[used], return_inverse=True)[1], shapes[used]
+        related, shapes = related.some(used), shapes[used]
         asked = CHOICE_MODES if settings.count == "auto" else settings.count
-        few = max(1, min(asked, (int(original_index.max()) + 1) // 3))
+        few = max(1, min(asked, related.originals // 3))
         straight, bent = (
-            _missed(reference, shapes, original_index, material, few, steps, first_step) for steps in (1, LIGHT_STEPS)
+            _missed(reference, shapes, related, material, few, steps, first_step) for steps in (1, LIGHT_STEPS)
         )
     except (ModeError, NotPositiveDefiniteError):  # the stages that need mean and modes report it
         return many
@@ -203,7 +195,7 @@ def nearest_exponentials(
 def _missed(
     reference: TriangleMesh,
     shapes: FloatArray,
-    original_index: IntArray,
+    related: Related,
     material: Material,
     modes: int,
     steps: int,
@@ -211,10 +203,9 @@ def _missed(
 ) -> float:
     """Return the mean distance between the originals among shapes (n, V, 3) and the modes of the other folds."""
     space, mean, fields = space_of(reference, shapes, material, steps, first_step)
-    count = int(original_index.max()) + 1
     away = []
-    for index in folds(count):
-        known = fields[~np.isin(original_index, index)]
+    for index in related.folds():
+        known = fields[related.without(index)]
         near = nearest_exponentials(space, mean, known, fields[index], shapes[index], modes, steps)
         away.append(vertex_distances(near, shapes[index], 1.0))
     return float(np.concatenate(away).mean())

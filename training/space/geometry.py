@@ -25,9 +25,7 @@ from shapespace.training.space.generalisation import (
     FOLDED_MODES,
     FOLDED_SHAPES,
     FOLDED_SHARE,
-    FOLDS,
     LIGHT_STEPS,
-    folds,
     many_steps,
     nearest_exponentials,
     space_of,
@@ -44,6 +42,7 @@ from shapespace.training.space.modes import (
     unseen_share,
     worthwhile_with_local,
 )
+from shapespace.training.space.related import FOLDS, Related
 from shapespace.training.space.straight_lines import StraightLines
 
 Kind = Literal["vertices", "nric", "differential", "exponential"]
@@ -103,7 +102,7 @@ def choose_geometry(
     reference: TriangleMesh,
     shapes: FloatArray,
     material: Material,
-    original_index: IntArray | None = None,
+    related: Related | None = None,
     first_step: FirstStep = "centred",
     among: Sequence[Kind] = COST,
     *,
@@ -122,19 +121,19 @@ def choose_geometry(
     If modes may ``vary``, the same folds then choose how much of the variance of its modes comes from local fields,
     unless the number of modes needs them anyway.
 
-    ``original_index`` (n,) is the index of each shape's original, from 0, mirror images last. ``among`` are the maps
-    that "auto" compares, in the order of their cost. A single one is not compared.
+    Shapes that are ``related`` are held out together; by default none are. ``among`` are the maps that "auto" compares,
+    in the order of their cost. A single one is not compared.
     """
-    original_index = np.arange(len(shapes)) if original_index is None else original_index
+    related = related or Related.none(len(shapes))
     if settings.geometry == "exponential":
-        steps = time_steps(settings, reference, shapes, material, original_index, first_step)
+        steps = time_steps(settings, reference, shapes, material, related, first_step)
         return GeometryChoice("exponential", steps)
     if settings.geometry != "auto":
         among = (settings.geometry,)
-    few = original_index.max() + 1 < FEWEST  # too few to compare exponentials
+    few = related.groups < FEWEST  # too few to compare exponentials
     if "exponential" in among and (few or (len(among) == 1 and not vary)):
         return GeometryChoice("exponential", _many(settings, first_step))
-    comparison = _Comparison(settings, reference, shapes, material, original_index, first_step, among, vary)
+    comparison = _Comparison(settings, reference, shapes, material, related, first_step, among, vary)
     return comparison.choice() if len(among) > 1 else comparison.of_one(among[0])
 
 
@@ -152,9 +151,7 @@ def _many(settings: ModeSettings, first_step: FirstStep) -> int:
     return many_steps(first_step)
 
 
-def straight_count(
-    settings: ModeSettings, lines: StraightLines, shapes: FloatArray, original_index: IntArray
-) -> ModeCount:
+def straight_count(settings: ModeSettings, lines: StraightLines, shapes: FloatArray, related: Related) -> ModeCount:
     """Return the number of modes of straight lines, as configured or by cross-validation.
 
     Errors are measured on vertices at the mean, see `worthwhile_with_local`.
@@ -167,7 +164,7 @@ def straight_count(
     def local() -> FloatArray:
         return local_fields(lines.reference, motions.reshape(len(shapes), -1, 3))
 
-    found = worthwhile_with_local(motions, local, original_index)
+    found = worthwhile_with_local(motions, local, related)
     count = min(found.supported, len(lines))
     return found if found.local else ModeCount(count, count)
 
@@ -262,18 +259,18 @@ class _Comparison:
         reference: TriangleMesh,
         shapes: FloatArray,
         material: Material,
-        original_index: IntArray,
+        related: Related,
         first_step: FirstStep,
         among: Sequence[Kind],
         vary: bool,
     ) -> None:
         self._settings, self._reference, self._shapes, self._material = settings, reference, shapes, material
-        self._original_index, self._among, self._vary = original_index, among, vary
-        used = original_index % -(-(original_index.max() + 1) // CHOICE_SHAPES) == 0
-        self._some, self._own = shapes[used], np.unique(original_index[used], return_inverse=True)[1]
+        self._related, self._among, self._vary = related, among, vary
+        used = related.spread(CHOICE_SHAPES)
+        self._some, self._relations = shapes[used], related.some(used)
         self._steps, self._first_step = _many(settings, first_step), first_step
         self._light = min(LIGHT_STEPS, self._steps)
-        self._folds = folds(int(self._own.max()) + 1)
+        self._folds = self._relations.folds()
         self._parts: dict[tuple[Kind, int], _Part] = {}
         self._measured: dict[tuple[Kind, int, int, float], FloatArray] = {}
 
@@ -285,9 +282,9 @@ class _Comparison:
                 maps[kind] = self._map(kind)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
-        supported = (int((~np.isin(self._own, index)).sum()) - 1 for index in self._folds)
+        supported = (len(self._relations.without(index)) - 1 for index in self._folds)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
-        counts = sorted({count, -(-count // 2)}) if self._own.max() + 1 < FEW else [count]
+        counts = sorted({count, -(-count // 2)}) if self._relations.originals < FEW else [count]
         straight = maps["vertices"].lines if "vertices" in maps else None
         folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
@@ -325,7 +322,7 @@ class _Comparison:
         if kind == "exponential":
             # They must reach enough shapes.
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-            own, (space, mean, fields) = mode_count(self._settings, *at, self._own), at
+            own, (space, mean, fields) = mode_count(self._settings, *at, self._relations), at
             centre = self._reference.with_vertices(mean)
 
             def exponentials(kept: IntArray, index: IntArray) -> _Part:
@@ -340,7 +337,7 @@ class _Comparison:
 
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)
-        own = straight_count(self._settings, lines, self._shapes, self._original_index)
+        own = straight_count(self._settings, lines, self._shapes, self._related)
         return _Map(kind, own, lines.motions(self._some), straight, lines)
 
     def _chosen(self, chosen: _Map) -> GeometryChoice:
@@ -349,10 +346,11 @@ class _Comparison:
         steps, count = (self._steps, None) if chosen.kind == "exponential" else (1, own.count)
         if own.local:
             return GeometryChoice(chosen.kind, steps, count, local_share=own.local.share, unseen_share=own.local.unseen)
-        share, gain = self._local_share(chosen) if self._vary and self._own.max() + 1 >= FOLDS else (0.0, 0.0)
+        share, gain = self._local_share(chosen) if self._vary and self._relations.groups >= FOLDS else (0.0, 0.0)
         if not share:
             return GeometryChoice(chosen.kind, steps, count)
-        unseen = unseen_share(left_of_held_out(chosen.rows @ chosen.rows.T, self._own), self._own)
+        left = left_of_held_out(chosen.rows @ chosen.rows.T, self._relations)
+        unseen = unseen_share(left, self._relations)
         return GeometryChoice(chosen.kind, steps, count, local_share=share, unseen_share=unseen, local_gain=gain)
 
     def _local_share(self, chosen: _Map) -> tuple[float, float]:
@@ -376,7 +374,7 @@ class _Comparison:
         """
         away = np.empty((0, 2))
         for fold, index in enumerate(self._folds):
-            count = max(1, min(chosen.own.count, int(self._own.max()) - len(index)))
+            count = max(1, min(chosen.own.count, self._relations.originals - len(index) - 1))
             both = np.stack([self._distances(chosen, fold, count, each) for each in (share, other)], axis=1)
             away = np.concatenate([away, both])
             gaps = away[:, 0] - away[:, 1]
@@ -390,8 +388,7 @@ class _Comparison:
         if key not in self._measured:
             index = self._folds[fold]
             if (chosen.kind, fold) not in self._parts:
-                kept = np.flatnonzero(~np.isin(self._own, index))
-                self._parts[chosen.kind, fold] = chosen.without(kept, index)
+                self._parts[chosen.kind, fold] = chosen.without(self._relations.without(index), index)
             near = self._parts[chosen.kind, fold].nearest(self._some[index], count, share)
             self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
         return self._measured[key]

@@ -33,6 +33,7 @@ from shapespace.training.space.local_fields import LocalVariation
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.memory import RememberingMap
 from shapespace.training.space.modes import ModeError, coefficients, mode_count
+from shapespace.training.space.related import Related
 from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 
@@ -85,7 +86,7 @@ def held_out(
     settings: ModeSettings,
     material: Material,
     steps: int | None = None,
-    original: IntArray | None = None,
+    related: Related | None = None,
     first_step: FirstStep = "centred",
     *,
     remember: bool = True,
@@ -94,33 +95,30 @@ def held_out(
 ) -> HeldOut:
     """Find mean and modes without some shapes, and approximate these shapes.
 
-    Shapes (n, V, 3) at ``index`` (k,) are held out, with their mirror images: ``original`` (n,) is the index of each
-    shape's original. ``counts`` are numbers of modes, by default the configured number and half of it, and at most the
-    number of the other shapes. The map from codes to shapes is as configured for the other shapes; "auto" chooses
-    ``among`` some maps, and whether modes ``vary`` locally. ``steps`` is K, by default as configured for these, and at
-    most `LIGHT_STEPS`; K stands for exponentials. The map may ``remember`` the shapes that it was found from, as
-    bundles do. Raises ModeError if the other shapes have no mean, or no modes.
+    Shapes (n, V, 3) at ``index`` (k,) are held out, and all shapes that are ``related`` to them. ``counts`` are numbers
+    of modes, by default the configured number and half of it, and at most the number of the other shapes. The map from
+    codes to shapes is as configured for the other shapes; "auto" chooses ``among`` some maps, and whether modes
+    ``vary`` locally. ``steps`` is K, by default as configured for these, and at most `LIGHT_STEPS`; K stands for
+    exponentials. The map may ``remember`` the shapes that it was found from, as bundles do. Raises ModeError if the
+    other shapes have no mean, or no modes.
     """
-    original = np.arange(len(shapes)) if original is None else original
-    known = np.flatnonzero(~np.isin(original, index))
-    kept, unseen = shapes[known], shapes[index]
-    original_index = np.unique(original[known], return_inverse=True)[1]
+    related = related or Related.none(len(shapes))
+    known = related.without(index)
+    kept, unseen, among_kept = shapes[known], shapes[index], related.some(known)
     if steps is None:
-        choice = choose_geometry(settings, reference, kept, material, original_index, first_step, among, vary=vary)
+        choice = choose_geometry(settings, reference, kept, material, among_kept, first_step, among, vary=vary)
     else:
         choice = GeometryChoice("exponential", steps)
     space: _Exponentials | StraightLines
     if choice.kind == "exponential":
         steps = choice.light_steps
-        space = _Exponentials(
-            settings, reference, kept, unseen, original_index, material, steps, first_step, choice.local
-        )
+        space = _Exponentials(settings, reference, kept, unseen, among_kept, material, steps, first_step, choice.local)
         count = space.count if choice.count is None else choice.count
     else:
         space = straight_lines(choice, kept, reference)
         count = choice.count or len(space)
     workers = -1 if choice.kind == "exponential" else 1  # shapes of straight lines take less time than processes
-    rivals = simple_models(reference, kept, original[known] == known)
+    rivals = simple_models(reference, kept, related.original[known] == known)
     reached, stuck = [], []
     near: dict[str, list[FloatArray]] = {kind: [] for kind in ("modes", *rivals)}
     for each in [-(-count // 2), count] if counts is None else counts:
@@ -185,18 +183,18 @@ class _Exponentials:
         reference: TriangleMesh,
         kept: FloatArray,
         unseen: FloatArray,
-        original_index: IntArray,
+        related: Related,
         material: Material,
         steps: int,
         first_step: FirstStep,
         local: LocalVariation | None,
     ) -> None:
-        self._settings, self._original_index, self._steps = settings, original_index, steps
+        self._settings, self._related, self._steps = settings, related, steps
         self._space, self._mean, self._fields = space_of(reference, kept, material, steps, first_step)
         # The search for codes starts from projected logarithms, because faces collapse on the straight line to a far
         # shape.
         self._towards = logarithms(self._space, self._mean, unseen, steps).fields
-        own = mode_count(settings, self._space, self._mean, self._fields, original_index)
+        own = mode_count(settings, self._space, self._mean, self._fields, related)
         self.count, self._local = own.count, own.local or local  # as configured
 
     def __len__(self) -> int:
@@ -207,7 +205,7 @@ class _Exponentials:
         """Return the exponentials along this number of modes."""
         found = copy(self)
         share = self._local.share if self._local else 0.0
-        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._original_index, share)
+        modes = find_modes(self._settings, self._space, self._mean, self._fields, count, self._related, share)
         found._modes, found._codes = modes.vertices, modes.coefficients
         found.shape = exponential_map(self._space, self._mean, found._modes, self._steps)
         return found

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from shapespace.arrays import FloatArray, IntArray
+from shapespace.arrays import FloatArray
 from shapespace.coordinates.normal_matrix import QuadraticForm
 from shapespace.coordinates.nric import WeightedNorm
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
@@ -34,6 +34,7 @@ from shapespace.mesh.triangle_mesh import vertex_areas
 from shapespace.shell.space import ShellPoint, ShellSpace
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.local_fields import LOCAL_SHARE, LocalVariation, local_fields, scale_of
+from shapespace.training.space.related import Related
 
 #: The norm of the misfit between modes and logarithms.
 Norm = Literal["mixed", "vertices", "shell"]
@@ -43,8 +44,6 @@ SHELL_SHARE = 0.1
 NEGLIGIBLE = 1e-9
 #: The localisation of a mode is the share of the edges that carries this part of its square norm.
 LOCALISED_PART = 0.95
-#: Number of inner folds by which the number of modes is chosen, each held out in its turn.
-INNER_FOLDS = 5
 #: Fewest shapes that can be held out: without one of them, two others still show a direction.
 FEWEST = 3
 #: A further mode has to lower the mean error of held-out logarithms by this share of their mean length.
@@ -100,35 +99,35 @@ def mode_count(
     space: ShellSpace,
     mean: FloatArray,
     fields: FloatArray,
-    original_index: IntArray | None = None,
+    related: Related | None = None,
 ) -> ModeCount:
     """Return the number of modes, as configured and less than n, or by cross-validation with `worthwhile`.
 
     The error is the distance between held-out logarithms and the span of principal modes of the other shapes. No
     exponentials are computed.
 
-    Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. ``original_index`` (n,)
-    is the index of each shape's original, from 0: a shape and its mirror image are held out together. Raises ModeError
-    if the fields can't be used.
+    Logarithms are (n, V, 3) at X̄ (V, 3); only ``count`` and ``norm`` of the settings matter. Shapes that are
+    ``related`` are held out together; by default none are. Raises ModeError if the fields can't be used.
     """
     if settings.count != "auto":
         count = max(1, min(settings.count, len(fields) - 1))
         return ModeCount(count, count)
     problem = ModeProblem(space, mean, fields, 1, validation_norm(settings.norm))
     if settings.norm == "shell":  # the paper's
-        count = worthwhile(left_of_held_out(problem.D @ problem.MD, original_index), original_index)
+        related = related or Related.none(len(fields))
+        count = worthwhile(left_of_held_out(problem.D @ problem.MD, related), related.most_modes)
         return ModeCount(count, count)
 
     def local() -> FloatArray:
         return local_fields(space.reference.with_vertices(mean), fields)
 
-    return worthwhile_with_local(problem.D, local, original_index, np.sqrt(problem.areas))
+    return worthwhile_with_local(problem.D, local, related, np.sqrt(problem.areas))
 
 
 def worthwhile_with_local(
     rows: FloatArray,
     local: Callable[[], FloatArray],
-    original_index: IntArray | None = None,
+    related: Related | None = None,
     root: FloatArray | float = 1.0,
 ) -> ModeCount:
     """Return the number of modes that pay for motions (n, 3V) of vertices, from their mean to shapes.
@@ -139,97 +138,55 @@ def worthwhile_with_local(
     """
     rows = rows * root
     n = len(rows)
-    original_index = np.arange(n) if original_index is None else original_index
-    left = left_of_held_out(rows @ rows.T, original_index)
-    count, most = worthwhile(left, original_index), most_modes(n, original_index)
-    if count < most or int(original_index.max()) + 1 < FEWEST:
+    related = related or Related.none(n)
+    left = left_of_held_out(rows @ rows.T, related)
+    count = worthwhile(left, related.most_modes)
+    if count < related.most_modes or related.groups < FEWEST:
         return ModeCount(count, count)
-    unseen = unseen_share(left, original_index)
+    unseen = unseen_share(left, related)
     share = LOCAL_SHARE * unseen
     if share < NEGLIGIBLE:
         return ModeCount(count, count)
     others = local()
     flat = others.reshape(-1, rows.shape[1]) * root
     every = np.concatenate([rows, scale_of(flat, rows, share) * flat])
-    left = left_of_held_out(every @ every.T, with_local(original_index, others))[:n]
-    more = worthwhile(left, original_index, len(every) - 1)
+    left = left_of_held_out(every @ every.T, related.with_local(others))[:n]
+    more = worthwhile(left, len(every) - 1)
     # As long as there are modes of the data, these are better.
     return ModeCount(more, count, LocalVariation(share, unseen)) if more >= n else ModeCount(count, count)
 
 
-def unseen_share(left: FloatArray, original_index: IntArray) -> float:
+def unseen_share(left: FloatArray, related: Related) -> float:
     """Return the share of the variance that held-out shapes have outside the span of the others, from square errors."""
-    return float(left[:, most_modes(len(left), original_index)].sum() / left[:, 0].sum())
+    return float(left[:, related.most_modes].sum() / left[:, 0].sum())
 
 
-def with_local(original_index: IntArray, local: FloatArray) -> IntArray:
-    """Return the indices of originals (n + nk,) of shapes and of their local fields (n, k, V, 3), see `inner_folds`."""
-    return np.concatenate([original_index, ~np.repeat(original_index, local.shape[1])])
-
-
-def worthwhile(left: FloatArray, original_index: IntArray | None = None, most: int | None = None) -> int:
+def worthwhile(left: FloatArray, most: int) -> int:
     """Return the number of modes that pay, from square errors (n, q) of held-out shapes for 0, 1, 2 … modes.
 
-    The choice m minimises ``error(m) + WORTH · m``, with the error as a share of the shapes' distance from the mean. It
-    is at most `most_modes`, or ``most``.
+    The choice m, at most ``most``, minimises ``error(m) + WORTH · m``, where the error is a share of the shapes'
+    distance from the mean.
     """
-    most = most_modes(len(left), original_index) if most is None else most
     errors = np.sqrt(left)[:, : 1 + most].mean(axis=0)
     return max(1, int(np.argmin(errors + WORTH * errors[0] * np.arange(len(errors)))))
 
 
-def left_of_held_out(gram: FloatArray, original_index: IntArray | None = None) -> FloatArray:
+def left_of_held_out(gram: FloatArray, related: Related) -> FloatArray:
     """Return square errors (n, n) of held-out vectors for 0, 1, 2 … principal modes of the other vectors.
 
     ``gram`` (n, n) has the inner products of the vectors. All are taken from the mean of the other vectors. Rows of
     local fields are 0.
     """
     n = len(gram)
-    original_index = np.arange(n) if original_index is None else original_index
     left = np.zeros((n, n))
-    for held, kept in inner_folds(original_index):
-        about = about_mean_of(kept, about_mean_of(kept, gram, original_index).T, original_index)
+    for held, kept in related.inner_folds():
+        about = related.about_mean_of(kept, related.about_mean_of(kept, gram).T)
         values, vectors = np.linalg.eigh(about[np.ix_(kept, kept)])
         some = np.flatnonzero(values > NEGLIGIBLE * gram.trace())[::-1]
         along = np.zeros((len(held), n))
         along[:, 1 : 1 + len(some)] = (about[np.ix_(held, kept)] @ vectors[:, some]) ** 2 / values[some]
         left[held] = np.maximum(about[held, held][:, None] - np.cumsum(along, axis=1), 0)
     return left
-
-
-def about_mean_of(kept: IntArray, rows: FloatArray, original_index: IntArray) -> FloatArray:
-    """Return rows (n, …) about the mean of those ``kept``, so that they show nothing of the others.
-
-    ``original_index`` (n,) is as for `inner_folds`. Local fields have the local fields of this mean as theirs.
-    """
-    local = np.flatnonzero(original_index < 0)
-    own = len(rows) - len(local)
-    number = np.zeros(len(rows), dtype=int)
-    number[local] = 1 + np.arange(len(local)) % max(1, len(local) // own)  # of the window
-    found = rows.copy()
-    for each in np.unique(number[kept]):
-        found[number == each] -= rows[kept[number[kept] == each]].mean(axis=0)
-    return found
-
-
-def inner_folds(original_index: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Return the indices of the shapes that are held out together, and of the fields that are kept, for each fold.
-
-    ``original_index`` (n,) is the index i of each shape's original, or ``~i`` for a local field of a shape. Local
-    fields of the shapes that are held out are neither held out nor kept.
-    """
-    parts = min(INNER_FOLDS, int(original_index.max()) + 1)
-    fold, own = np.where(original_index < 0, ~original_index, original_index) % parts, original_index >= 0
-    return [(np.flatnonzero(own & (fold == part)), np.flatnonzero(fold != part)) for part in range(parts)]
-
-
-def most_modes(count: int, original_index: IntArray | None = None) -> int:
-    """Return the largest number of modes that inner folds of ``count`` shapes support: one less than the originals of
-    a fold. A mirror image adds no shape, so it supports no further mode.
-    """
-    originals = count if original_index is None else int(original_index.max()) + 1
-    parts = min(INNER_FOLDS, originals)
-    return max(1, originals - -(-originals // parts) - 1)
 
 
 def validation_norm(norm: Norm) -> Norm:

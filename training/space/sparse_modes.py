@@ -44,19 +44,16 @@ from shapespace.training.runs.progress import progress
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.local_fields import local_fields, scale_of
 from shapespace.training.space.modes import (
-    INNER_FOLDS,
     NEGLIGIBLE,
     ModeProblem,
     Modes,
     Norm,
-    about_mean_of,
     coefficients,
-    inner_folds,
     localisation,
     pga,
     validation_norm,
-    with_local,
 )
+from shapespace.training.space.related import INNER_FOLDS, Related
 
 #: ADMM iterations on modes before the next modes, and their over-relaxation, between 1 and 2.
 ADMM_ITERATIONS, OVERRELAXATION = 5, 1.6
@@ -85,19 +82,20 @@ def find_modes(
     mean: FloatArray,
     fields: FloatArray,
     count: int,
-    original_index: IntArray | None = None,
+    related: Related | None = None,
     local: float = 0.0,
 ) -> Modes:
     """Find ``count`` modes of logarithms (n, V, 3) at a mean (V, 3), as configured, and of their ``local`` fields with
-    this share of the variance. Raises ModeError if the count or the sparsity is not possible.
+    this share of the variance. To choose the sparsity, shapes that are ``related`` are held out together. Raises
+    ModeError if the count or the sparsity is not possible.
     """
     if local:
         n = len(fields)
         others = local_fields(space.reference.with_vertices(mean), fields)
         others *= scale_of(others, fields, local)
         every = np.concatenate([fields, others.reshape(-1, *mean.shape)])
-        whose = with_local(np.arange(n) if original_index is None else original_index, others)
-        found = find_modes(settings, space, mean, every, count, whose)
+        every_related = (related or Related.none(n)).with_local(others)
+        found = find_modes(settings, space, mean, every, count, every_related)
         codes, explained = coefficients(space, mean, fields, found.vertices, settings.norm)
         spread = np.sqrt((found.coefficients[n:] ** 2).sum(axis=0) / n)
         return replace(found, coefficients=codes, explained=explained, spread=spread)
@@ -110,7 +108,7 @@ def find_modes(
         count,
         None if settings.sparsity == "auto" else settings.sparsity,
         settings.norm,
-        original_index=original_index,
+        related=related,
         max_iterations=settings.max_iterations,
         tolerance=TOLERANCE[settings.norm],
     )
@@ -124,7 +122,7 @@ def spga(
     sparsity: float | None,
     norm: Norm = "mixed",
     *,
-    original_index: IntArray | None = None,
+    related: Related | None = None,
     max_iterations: int = 200,
     tolerance: float = 1e-3,
 ) -> Modes:
@@ -137,12 +135,13 @@ def spga(
     that price the last of these modes vanishes. 0 gives the span of the plain analysis. None chooses one of
     `SPARSITIES`, or plain modes where all cost too much, by errors in vertices, or in the norm "shell" where that
     is the norm. Logarithms are (n, V, 3) at X̄ (V, 3), and η of the space also weighs the angles in the 1-norm. For
-    ``original_index`` see modes.mode_count, for ``tolerance`` see `TOLERANCE`. Raises ModeError if the count is not
+    ``related`` see modes.mode_count, for ``tolerance`` see `TOLERANCE`. Raises ModeError if the count is not
     possible, or the sparsity leaves no mode.
     """
     problem = _SparseProblem(space, mean, fields, count, norm)
     if sparsity is None:
-        sparsity = _chosen_sparsity(space, mean, fields, count, norm, original_index, max_iterations)
+        related = related or Related.none(len(fields))
+        sparsity = _chosen_sparsity(space, mean, fields, count, norm, related, max_iterations)
         if sparsity == 0:
             return pga(space, mean, fields, count, validation_norm(norm))
     D, W, highest = problem.start(count)
@@ -226,18 +225,16 @@ def _chosen_sparsity(
     fields: FloatArray,
     count: int,
     norm: Norm,
-    original_index: IntArray | None,
+    related: Related,
     max_iterations: int,
 ) -> float:
     """Return the largest sparsity that costs little on held-out shapes, see `SPARSITIES`; 0 if there is none."""
-    original_index = np.arange(len(fields)) if original_index is None else original_index
-    originals = int(original_index.max()) + 1
-    folds = inner_folds(original_index) if originals > 1 else []
-    enough = -(-HELD_OUT * len(folds) // originals)
+    folds = related.inner_folds() if related.groups > 1 else []
+    enough = -(-HELD_OUT * len(folds) // related.originals)
     trials = []
     for held, kept in folds[:enough]:
         # About their own mean, fewer shapes would have too few modes to tell.
-        about = about_mean_of(kept, fields, original_index) if originals >= INNER_FOLDS else fields
+        about = related.about_mean_of(kept, fields) if related.groups >= INNER_FOLDS else fields
         trials.append(_Trial(space, mean, about[kept], about[held], min(count, len(kept)), norm))
     if not trials:
         return 0.0

@@ -5,10 +5,11 @@ from typing import Any
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.provenance import MADE_BY, made_by
-from shapespace.training.space.generalisation import FOLDS, folds, summary
+from shapespace.training.space.generalisation import summary
 from shapespace.training.space.geometry import COST, hopeful
 from shapespace.training.space.held_out import held_out, joined
 from shapespace.training.space.modes import ModeError
+from shapespace.training.space.related import FOLDS, Related
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 
@@ -23,14 +24,13 @@ def measure_generalisation(run: Run) -> None:
     """
     directory, material = run.directory, run.config.shell_material
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
-    shapes, original = given["vertices"], given["original"]
-    count, first_step = int(original.max()) + 1, run.config.exponential.first_step
+    shapes, related, first_step = given["vertices"], Related.of_arrays(given), run.config.exponential.first_step
     chosen = directory.geometry.read_if_written()
-    some = folds(count)[: 1 if count >= 2 * FOLDS else None]
+    some = related.folds()[: 1 if related.groups >= 2 * FOLDS else None]
     facts: dict[str, Any]
     try:
         how: dict[str, Any] = {
-            "original": original,
+            "related": related,
             "first_step": first_step,
             "remember": run.config.export.examples,
             "among": hopeful(chosen["kind"], chosen["errors"]) if chosen else COST,
@@ -48,6 +48,7 @@ def measure_generalisation(run: Run) -> None:
         ended = ~found.stuck[-1]
         facts = {
             "held_out": len(found.index),
+            **({"groups": related.groups} if "group" in given else {}),
             "maps": sorted(set(found.maps)),
             "steps": int(found.steps.max()),
             "counts": found.counts[different],

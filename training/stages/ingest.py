@@ -15,13 +15,14 @@ from shapespace.mesh.fine_detail import GAIN, RIDGES
 from shapespace.mesh.prolongation import AttachedPart, Prolongation, submesh
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.collection.appearance import kept, reference_surface, texture_bytes
+from shapespace.training.collection.groups import groups_of
 from shapespace.training.collection.large_arrays import some_vertices, stacked
 from shapespace.training.collection.mesh_collection import MeshCollection, normalised
 from shapespace.training.collection.mirror import find_mirror, mirrored
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.runs.progress import waiting
 from shapespace.training.runs.settings import NEARLY_COARSE, CollectionSettings
-from shapespace.training.space.generalisation import FOLDS
+from shapespace.training.space.related import FOLDS
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 #: Most vertices of all fine shapes together for which fine detail is learned. It takes memory for several copies.
@@ -45,11 +46,15 @@ def ingest(run: Run) -> None:
     meshes = run.meshes
     del run.meshes  # they may be large
     chosen = meshes.index(settings.reference)
+    related = {} if settings.related is None else {"group": groups_of(meshes.names, settings.related)}
     vertices, scale = normalised(meshes, chosen)
     fine = TriangleMesh.from_arrays(vertices[chosen], meshes.faces)
     images, original_index, notes = _mirror_images(settings, meshes, vertices, fine.edges)
     facts: dict[str, Any] = {"shapes": len(vertices), "vertices": vertices.shape[1], "reference": meshes.names[chosen]}
     facts["images"] = len(images)
+    if related:
+        groups = int(related["group"].max()) + 1
+        notes.append(f"{counted(groups, 'group')} of related shapes: to measure errors, whole groups are left out")
     facts["notes"] = [*meshes.notes, *notes]
     facts["warnings"] = [warned.sentence for warned in meshes.warnings]
     reference, index, coarsened = _coarse_mesh(settings, meshes, fine, vertices, images)
@@ -79,6 +84,7 @@ def ingest(run: Run) -> None:
         original=original,
         files=files,
         first=first,
+        **related,
     )
     surface, left_out = reference_surface(settings.data, meshes, chosen)
     facts["warnings"] += left_out

@@ -14,6 +14,7 @@ from shapespace.training.space.generalisation import LIGHT_STEPS
 from shapespace.training.space.geometry import choose_geometry
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError
+from shapespace.training.space.related import Related
 from shapespace.training.space.straight_lines import StraightLines
 from shapespace.training.stages.stage import Run, Stage
 
@@ -35,7 +36,7 @@ def find_mean(run: Run) -> None:
     shapes = given["vertices"]
     first_step = run.config.exponential.first_step
     try:
-        choice = choose_geometry(run.config.modes, reference, shapes, material, given["original"], first_step)
+        choice = choose_geometry(run.config.modes, reference, shapes, material, Related.of_arrays(given), first_step)
     except ModeError as error:
         raise MeanError(
             f"the shapes have no mean of the kind that modes.geometry asks for: {error}; choose another modes.geometry"

@@ -16,6 +16,7 @@ from shapespace.training.space.generalisation import summary, vertex_distances
 from shapespace.training.space.geometry import GeometryChoice, straight_lines
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.modes import localisation, mode_count
+from shapespace.training.space.related import Related
 from shapespace.training.space.sparse_modes import find_modes
 from shapespace.training.stages.stage import Run, Stage, StageWarning, against_failures, listed
 
@@ -29,17 +30,17 @@ def decompose(run: Run) -> None:
         _straighten(run)
         return
     settings, centre, given = config.modes, directory.mean_mesh(), directory.shapes.read()
-    shapes, original_index = given["vertices"], given["original"]
+    shapes, related = given["vertices"], Related.of_arrays(given)
     space = ShellSpace(centre, config.shell_material, first_step=config.exponential.first_step)
     norm = WeightedNorm.of(centre, config.material.eta)
     steps = directory.log_steps()
     found = logarithms(space, centre.vertices, shapes, steps)
-    own = mode_count(settings, space, centre.vertices, found.fields, original_index)
+    own = mode_count(settings, space, centre.vertices, found.fields, related)
     chosen = directory.geometry.read_if_written()
     count, local = own.count, own.local or (GeometryChoice(**chosen).local if chosen else None)
     plain = settings.model_copy(update={"sparsity": 0})
     dense, sparse = (
-        find_modes(each, space, centre.vertices, found.fields, count, original_index, local.share if local else 0.0)
+        find_modes(each, space, centre.vertices, found.fields, count, related, local.share if local else 0.0)
         for each in (plain, settings)
     )
     shooting = steps

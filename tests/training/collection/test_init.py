@@ -15,6 +15,7 @@ from shapespace.__main__ import main as every_command
 from shapespace.files.formats import MESH_FORMATS
 from shapespace.training import __main__ as command
 from shapespace.training.collection.faults import IngestError
+from shapespace.training.collection.groups import groups_of
 from shapespace.training.collection.ingest import read_collection
 from shapespace.training.collection.init import slug, write
 from shapespace.training.runs.config import Config, ConfigError, load, parse
@@ -44,6 +45,19 @@ def test_values_come_from_the_meshes(tmp_path: Path) -> None:
     assert "at most 24" in out.read_text()
     assert (config.export.name, config.export.title) == ("my-meshes-2", "My Meshes_2")
     assert "coarse_vertices" not in config.collection.model_fields_set
+
+
+def test_scans_of_one_subject_are_related(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    for k, name in enumerate(["sub-01_ses-1", "sub-01_ses-2", "sub-02_ses-1", "sub-ab_ses-1"]):
+        (tmp_path / f"{name}.npz").write_bytes(MESH_FORMATS["npz"].encode(ball.vertices * [1, 1, 1 + k], ball.faces))
+    out, collection = write(tmp_path, tmp_path / "here.toml")
+    expression = load(out)[0].collection.related
+    assert expression is not None
+    assert groups_of(collection.names, expression).tolist() == [0, 0, 1, 2]
+    (tmp_path / "sub-01_ses-2.npz").unlink()
+    once, _ = write(tmp_path, tmp_path / "here.toml", force=True)
+    assert load(once)[0].collection.related is None
 
 
 def test_large_meshes_are_coarsened(tmp_path: Path) -> None:

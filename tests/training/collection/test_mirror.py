@@ -14,6 +14,7 @@ from shapespace.training.collection.mirror import TOLERANCE, find_mirror, mirror
 from shapespace.training.runs.config import Config
 from shapespace.training.runs.directory import RunDirectory
 from shapespace.training.space.held_out import held_out
+from shapespace.training.space.related import Related
 from shapespace.training.stages.ingest import ingest
 from shapespace.training.stages.stage import Run
 
@@ -127,10 +128,10 @@ def test_held_out_shapes_take_their_images_with_them(with_images: tuple[RunDirec
     others = shapes["vertices"].copy()
     others[5] *= 1.3  # the image of shape 1
     found, again, without = (
-        held_out(run.reference_mesh(), each, np.array([1]), [2], config.modes, config.shell_material, 4, original)
-        for each, original in (
-            (shapes["vertices"], shapes["original"]),
-            (others, shapes["original"]),
+        held_out(run.reference_mesh(), each, np.array([1]), [2], config.modes, config.shell_material, 4, related)
+        for each, related in (
+            (shapes["vertices"], Related.of_arrays(shapes)),
+            (others, Related.of_arrays(shapes)),
             (shapes["vertices"][:5], None),
         )
     )

@@ -11,7 +11,6 @@ from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.codes import box_of
 from shapespace.training.space.generalisation import (
     PrincipalComponents,
-    folds,
     nearest_exponentials,
     summary,
     time_steps,
@@ -85,13 +84,6 @@ def test_one_step_comes_nearer_to_blend_shapes(blends):
     assert found.steps.tolist() == [1, 1]
     away, more = (each.distances(linear, mesh.diagonal)["modes"][0].mean() for each in (found, more_steps))
     assert away < 0.4 * more
-
-
-@pytest.mark.parametrize(("count", "parts"), [(3, 3), (9, 9), (10, 5), (57, 5)])
-def test_folds_hold_every_shape_out_once(count, parts):
-    found = folds(count)
-    assert len(found) == parts
-    assert sorted(np.concatenate(found)) == list(range(count))
 
 
 def test_components_reproduce_what_they_were_found_from_and_come_nearer_with_more(shapes, rng):

@@ -7,7 +7,6 @@ from shapespace.shell.energy import Material
 from shapespace.training.runs.settings import ModeSettings
 from shapespace.training.space.geometry import COST, certain, cheapest, choose_geometry, hopeful
 from shapespace.training.space.held_out import held_out
-from shapespace.training.space.modes import most_modes
 from tests.training.conftest import bent
 
 AUTO = ModeSettings(geometry="auto")
@@ -94,10 +93,3 @@ def test_folds_end_once_the_choice_is_certain(rng):
     assert certain({"vertices": 2 * theirs, "nric": theirs, "exponential": 1.5 * theirs}, "nric")
     near = theirs * rng.uniform(1.0, 1.06, 10)
     assert not certain({"nric": near, "exponential": theirs}, "exponential"), "too close to tell"
-
-
-@pytest.mark.parametrize(("count", "most"), [(3, 1), (5, 3), (10, 7), (47, 36)])
-def test_there_are_no_more_modes_than_folds_support(count, most):
-    assert most_modes(count) == most
-    images = np.concatenate([np.arange(count)] * 2)
-    assert most_modes(2 * count, images) == most, "an image is no further shape"

@@ -21,7 +21,7 @@ from shapespace.training.space.generalisation import PrincipalComponents, vertex
 from shapespace.training.space.geometry import choose_geometry, straight_lines
 from shapespace.training.space.held_out import held_out
 from shapespace.training.space.local_fields import WIDTH, local_fields, windows
-from shapespace.training.space.modes import inner_folds, most_modes, with_local
+from shapespace.training.space.related import Related
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 from shapespace.training.stages.run import execute
 from shapespace.training.stages.stage import Run
@@ -79,7 +79,7 @@ def test_eight_poses_come_nearer_to_unseen_poses_with_local_fields() -> None:
     known, unseen = np.split(figure.pose(poses), [KNOWN])
     choice = choose_geometry(AUTO, rest, known, Material(), among=("vertices",))
     assert choice.count is not None
-    assert choice.count > KNOWN - 1 > most_modes(KNOWN)
+    assert choice.count > KNOWN - 1 > Related.none(KNOWN).most_modes
     lines = straight_lines(choice, known, rest).first(choice.count)
     components = PrincipalComponents.of(known, rest.vertices).nearest(unseen, KNOWN - 1)
     ours, theirs = (
@@ -93,17 +93,6 @@ def test_no_more_modes_than_asked_for_or_than_shapes(ellipsoid: TriangleMesh, wa
     assert held_out(ellipsoid, waves, index, None, AUTO, Material()).counts[-1] > KNOWN - 1
     asked = ModeSettings(geometry="vertices", count=KNOWN + 5)
     assert held_out(ellipsoid, waves, index, None, asked, Material()).counts[-1] == KNOWN - 1
-
-
-def test_local_fields_are_held_out_with_their_shapes() -> None:
-    originals = np.array([0, 1, 2, 3, 4, 5, 0, 1])  # the last two are mirror images
-    whose = with_local(originals, np.empty((8, 3, 1, 3)))
-    folds = inner_folds(whose)
-    assert sorted(np.concatenate([held for held, _ in folds])) == list(range(8)), "each shape once, no local field"
-    for held, kept in folds:
-        own = np.concatenate([originals, np.repeat(originals, 3)])
-        assert not set(own[held]) & set(own[kept])
-        assert set(own[held]) | set(own[kept]) == set(range(6))
 
 
 @pytest.fixture(scope="module")

@@ -24,12 +24,12 @@ from shapespace.training.space.modes import (
     ModeError,
     Modes,
     Norm,
-    inner_folds,
     left_of_held_out,
     localisation,
     mode_count,
     pga,
 )
+from shapespace.training.space.related import Related
 from shapespace.training.space.sparse_modes import _fit_in_box, spga
 from tests.shapespace.conftest import bent
 
@@ -441,9 +441,9 @@ def test_a_shape_and_its_mirror_image_are_held_out_together(mixed: Bumps) -> Non
     """The count of modes of each logarithm twice is that of each once; held out alone, each would be known already."""
     rng = np.random.default_rng(5)
     noisy = mixed.fields + 0.3 * np.abs(mixed.fields).max() * rng.normal(size=mixed.fields.shape)
-    twice, whose = np.concatenate([noisy, noisy]), np.tile(np.arange(len(noisy)), 2)
+    twice, images = np.concatenate([noisy, noisy]), Related.images(np.tile(np.arange(len(noisy)), 2))
     once = mode_count(ModeSettings(), mixed.space, mixed.mean, noisy).count
-    assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice, whose).count == once
+    assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice, images).count == once
     assert mode_count(ModeSettings(), mixed.space, mixed.mean, twice).count > once
 
 
@@ -452,8 +452,9 @@ def test_inner_folds_know_nothing_of_what_is_held_out(origin: float | None) -> N
     """Wherever the origin lies, errors are those of principal components about the mean of the other rows."""
     rows = np.random.default_rng(0).standard_normal((12, 30)) + 1
     about = rows - (rows.mean(axis=0) if origin is None else origin)
-    left = left_of_held_out(about @ about.T)
-    for held, kept in inner_folds(np.arange(len(rows))):
+    related = Related.none(len(rows))
+    left = left_of_held_out(about @ about.T, related)
+    for held, kept in related.inner_folds():
         mean = rows[kept].mean(axis=0)
         components = np.linalg.svd(rows[kept] - mean, full_matrices=False)[2]
         for count in (0, 1, 3, len(kept) - 1):

@@ -115,6 +115,28 @@ def test_unseen_shapes_do_not_try_maps_that_were_clearly_worse_on_all_shapes(
     assert run.directory.generalisation.read()["maps"] == ["nric"]
 
 
+def test_related_shapes_are_left_out_together(ellipsoid: TriangleMesh, tmp_path: Path) -> None:
+    """Each bend comes in three scans that differ a little. Alone, a left-out scan would be known already."""
+    rng = np.random.default_rng(0)
+    scans = np.repeat(bent(ellipsoid, np.linspace(-1, 1, 5)), 3, axis=0)
+    scans += 0.1 * rng.normal(size=(5, 1, *ellipsoid.vertices.shape)).repeat(3, axis=1).reshape(scans.shape)
+    scans += 0.001 * rng.normal(size=scans.shape)
+    names = [f"sub-{k // 3} scan {k % 3}" for k in range(15)]
+    data = tmp_path / "shapes.npz"
+    np.savez(data, vertices=scans, faces=ellipsoid.faces, names=names)
+    text = CONFIG.format(data=json.dumps(str(data)), geometry="vertices", count=4, examples="true", decoder="false")
+    errors = {}
+    for name, related in {"alone": "", "together": "related = 'sub-[0-9]+'\n"}.items():
+        given = text.replace("mirror = false\n", f"mirror = false\n{related}")
+        run = Run(tmp_path / name, parse(given, "straight.toml"), given, tmp_path / "models")
+        said: list[str] = []
+        assert execute(run, show=said.append)
+        errors[name] = run.directory.generalisation.read()["modes"][-1]["mean"]
+        assert any("5 groups of related shapes" in sentence for sentence in said) == bool(related)
+        assert ("with all shapes related to them" in _report(run)) == bool(related)
+    assert errors["together"] > 5 * errors["alone"]
+
+
 def test_a_run_says_that_there_are_fewer_modes_than_asked_for(
     blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path
 ) -> None:
