@@ -40,10 +40,9 @@ class ShapeSource:
     folder: Path | None = None  # folder of the collection, if each shape has a folder in it
 
     @classmethod
-    def of_file(cls, path: Path, folder: Path | None = None) -> ShapeSource:
-        """Return the source of a shape with its own file, or with its own folder in the collection's."""
-        name = path.relative_to(folder).parts[0] if folder else path.stem
-        return cls(str(path), name, int(path.suffix.lower() == ".obj"), folder)
+    def of_file(cls, path: Path, name: str | None = None, folder: Path | None = None) -> ShapeSource:
+        """Return the source of a shape with its own file, or with a name and its own folder in the collection's."""
+        return cls(str(path), name or path.stem, int(path.suffix.lower() == ".obj"), folder)
 
     @property
     def file(self) -> str:

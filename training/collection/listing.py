@@ -141,25 +141,28 @@ def _accompanies(path: Path, formats: set[str]) -> bool:
 
 
 def _subjects(folder: Path, file: str) -> MeshFiles:
-    """List one file of each subject's folder."""
+    """List one file of each subject's folder, or of each of its folders that match a pattern."""
     found = _files_of_subjects(folder, file)
     faults = [
-        Fault(str(folder / name), f"has {len(paths)} files {file}", "give the whole name of the file, without * and ?")
-        for name, paths in found.items()
+        Fault(
+            str(paths[0].parent), f"has {len(paths)} files {file}", "give the whole name of the file, without * and ?"
+        )
+        for paths in found.values()
         if len(paths) > 1
     ]
     chosen = {name: paths[0] for name, paths in found.items() if len(paths) == 1}
-    formats = {extension(path) for path in chosen.values()}
+    paths = set(chosen.values())
+    formats, parents = {extension(path) for path in paths}, {path.parent for path in paths}
     beside: Counter[str] = Counter()
-    for name, path in chosen.items():
-        inside = (p for p in (folder / name).rglob("*") if p != path and not p.is_dir())
+    for subject in {folder / path.relative_to(folder).parts[0] for path in paths}:
         beside.update(
-            p.relative_to(folder / name).as_posix()
-            for p in inside
-            if not (p.parent == path.parent and _accompanies(p, formats))
+            p.relative_to(subject).as_posix()
+            for p in subject.rglob("*")
+            if p not in paths and not p.is_dir() and not (p.parent in parents and _accompanies(p, formats))
         )
     times = [f"{name} ({count} times)" if count > 1 else name for name, count in sorted(beside.items())]
-    tops = sorted((p.name for p in folder.iterdir() if p.name not in found), key=natural_order)
+    subjects = {p.name for p in _folders(folder)}
+    tops = sorted((p.name for p in folder.iterdir() if p.name not in subjects), key=natural_order)
     left_out = (
         _left_out(f"they have no file {file}", [f"{name}/" for name, paths in found.items() if not paths]),
         _left_out(f"only {file} is read from each folder", times),
@@ -168,14 +171,18 @@ def _subjects(folder: Path, file: str) -> MeshFiles:
     return MeshFiles(
         folder,
         tuple(chosen.values()),
-        tuple(ShapeSource.of_file(path, folder) for path in chosen.values()),
+        tuple(ShapeSource.of_file(path, name, folder) for name, path in chosen.items()),
         tuple(filter(None, left_out)),
         tuple(faults),
     )
 
 
 def _files_of_subjects(folder: Path, file: str) -> dict[str, list[Path]]:
-    """Return the files of each subject that have a name or match a pattern; raises IngestError for other paths."""
+    """Return the files that have a name or match a pattern, by the name of the shape.
+
+    A shape has the name of the subject's folder. Where folders inside it match a pattern, such as ``ses-*/surf.ply``,
+    their names follow. Raises IngestError for paths that are none of a file within a folder.
+    """
     if PurePosixPath(file).is_absolute() or ".." in PurePosixPath(file).parts or not PurePosixPath(file).name:
         raise IngestError(
             Fault(str(folder), f"{file!r} is not a path within a folder", "name the file that each folder has")
@@ -184,28 +191,46 @@ def _files_of_subjects(folder: Path, file: str) -> dict[str, list[Path]]:
         raise IngestError(
             Fault(str(folder), f"the format of {file!r} is not read", f"these are: {', '.join(READ_FORMATS)}")
         )
-    found = {}
-    for subject in sorted((p for p in _visible(folder) if p.is_dir()), key=lambda path: natural_order(path.name)):
+    found: dict[str, list[Path]] = {}
+    for subject in sorted(_folders(folder), key=lambda path: natural_order(path.name)):
         named = subject / file
         matching = [named] if named.is_file() else [p for p in subject.glob(file) if p.is_file()]
-        found[subject.name] = sorted(matching, key=lambda path: natural_order(path.name))
+        if not matching:
+            found[subject.name] = []
+        for path in sorted(matching, key=lambda path: natural_order(path.as_posix())):
+            found.setdefault("_".join([subject.name, *_matched(path.relative_to(subject), file)]), []).append(path)
     return found
+
+
+def _folders(folder: Path) -> list[Path]:
+    return [path for path in _visible(folder) if path.is_dir()]
+
+
+def _matched(path: Path, file: str) -> list[str]:
+    """Return the folders of a path that match a pattern in the path of a file, from outside to inside."""
+    if "**" in PurePosixPath(file).parts:
+        return list(path.parts[:-1])
+    both = zip(path.parts[:-1], PurePosixPath(file).parts[:-1], strict=True)
+    return [name for name, given in both if re.search(r"[*?\[]", given)]
 
 
 def _nested(folder: Path) -> str:
     """Return what to do about a folder whose folders have meshes; empty if they have none."""
     names: Counter[str] = Counter()
-    for subject in (p for p in _visible(folder) if p.is_dir()):
-        inside = (p for pattern in ("*", "*/*") for p in subject.glob(pattern) if p.name[0] != "." and p.is_file())
+    for subject in _folders(folder):
+        inside = (
+            p for pattern in ("*", "*/*", "*/*/*") for p in subject.glob(pattern) if p.name[0] != "." and p.is_file()
+        )
         meshes = {p.relative_to(subject).as_posix() for p in inside if extension(p) in READ_FORMATS}
-        # A name that repeats the folder's: sub-01/sub-01_mesh.ply.
+        # A name that repeats the folder's: sub-01/sub-01_mesh.ply. Several folders of a subject: sub-01/ses-1/mesh.ply.
         names.update(meshes | {name.replace(subject.name, "*") for name in meshes})
+        names.update(re.sub(r"^[^/]+/", "*/", name) for name in meshes if "/" in name)
     if not names:
         return ""
     file, count = max(names.items(), key=lambda item: (item[1], "*" not in item[0]))
     return (
-        f"read one file from each folder: init {shlex.quote(str(folder))} --file {shlex.quote(file)} ({count} "
-        "folders have it), or set file in [collection] of the configuration"
+        f"read one file from each folder: init {shlex.quote(str(folder))} --file {shlex.quote(file)} "
+        f"({counted(count, 'file')}), or set file in [collection] of the configuration"
     )
 
 

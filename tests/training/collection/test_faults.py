@@ -150,9 +150,24 @@ def test_a_folder_of_subjects_alone_is_refused_with_the_argument_that_reads_it(
     names: str, file: str, tmp_path: Path
 ) -> None:
     study = balls(tmp_path / "study", names, 4)
-    with pytest.raises(IngestError, match=re.escape(f"--file {shlex.quote(file)} (4 folders have it)")):
+    with pytest.raises(IngestError, match=re.escape(f"--file {shlex.quote(file)} (4 files)")):
         read_collection(study)
     assert len(read_collection(study, file=file).names) == 4
+
+
+def test_subjects_may_have_a_folder_for_each_session(tmp_path: Path) -> None:
+    study = tmp_path / "study"
+    for k in range(2):
+        balls(study / f"sub-0{k}", "ses-{}/surf/pial.ply", 2 + k)
+    with pytest.raises(IngestError, match=re.escape("--file '*/surf/pial.ply' (5 files)")):
+        read_collection(study)
+    names = ["sub-00_ses-0", "sub-00_ses-1", "sub-01_ses-0", "sub-01_ses-1", "sub-01_ses-2"]
+    for file in ("ses-*/surf/pial.ply", "*/*/pial.ply", "**/pial.ply"):
+        ending = "" if file.startswith("ses") else "_surf"
+        assert list(read_collection(study, file=file).names) == [name + ending for name in names]
+    write(study / "sub-01" / "ses-1" / "surf" / "white.ply", ball(1))
+    with pytest.raises(IngestError, match=re.escape(f"{Path('sub-01/ses-1/surf')}: has 2 files ses-*/surf/*.ply")):
+        read_collection(study, file="ses-*/surf/*.ply")
 
 
 @pytest.mark.parametrize(
