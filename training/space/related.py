@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from shapespace.arrays import FloatArray, IntArray
 
-#: Number of folds. Below twice this number of groups, each group is held out by itself.
+#: Number of folds. Below twice this number of shapes, each shape is held out by itself.
 FOLDS = 5
 #: Number of inner folds by which modes are chosen, each held out in its turn.
 INNER_FOLDS = 5
@@ -58,6 +58,11 @@ class Related:
         """Return the group (n,) of each row."""
         return self.group[np.where(self.original < 0, ~self.original, self.original)]
 
+    @property
+    def few(self) -> bool:
+        """Whether each group is held out by itself, because there are few shapes."""
+        return self.originals < 2 * FOLDS
+
     def some(self, used: NDArray[np.bool_] | IntArray) -> Related:
         """Return the relations among some rows, marked (n,) or at an index (k,)."""
         kept = np.unique(self.original[used], return_inverse=True)
@@ -75,7 +80,7 @@ class Related:
 
     def folds(self) -> list[IntArray]:
         """Return the indices of the originals that are held out together, for each fold."""
-        parts = FOLDS if self.groups >= 2 * FOLDS else self.groups
+        parts = self.groups if self.few else min(FOLDS, self.groups)
         return [np.flatnonzero(self.group % parts == fold) for fold in range(parts)]
 
     def inner_folds(self) -> list[tuple[IntArray, IntArray]]:

@@ -9,7 +9,7 @@ from shapespace.training.space.generalisation import summary
 from shapespace.training.space.geometry import COST, hopeful
 from shapespace.training.space.held_out import held_out, joined
 from shapespace.training.space.modes import ModeError
-from shapespace.training.space.related import FOLDS, Related
+from shapespace.training.space.related import Related
 from shapespace.training.stages.stage import Run, Stage, StageWarning
 
 
@@ -26,7 +26,7 @@ def measure_generalisation(run: Run) -> None:
     reference, given, settings = directory.reference_mesh(), directory.shapes.read(), run.config.modes
     shapes, related, first_step = given["vertices"], Related.of_arrays(given), run.config.exponential.first_step
     chosen = directory.geometry.read_if_written()
-    some = related.folds()[: 1 if related.groups >= 2 * FOLDS else None]
+    some = related.folds()[: None if related.few else 1]
     facts: dict[str, Any]
     try:
         how: dict[str, Any] = {

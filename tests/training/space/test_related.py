@@ -41,6 +41,13 @@ def test_groups_are_held_out_as_a_whole() -> None:
     assert SUBJECTS.most_modes == 2, "the fold without the first subject keeps three originals"
 
 
+@pytest.mark.parametrize(("groups", "parts"), [(3, 3), (7, 5), (30, 5)])
+def test_many_shapes_in_few_groups_have_few_folds(groups: int, parts: int) -> None:
+    related = Related(np.arange(60), np.arange(60) % groups)
+    assert len(related.folds()) == parts
+    assert not related.few
+
+
 def test_a_part_keeps_its_relations() -> None:
     some = SUBJECTS.some(np.array([1, 3, 4, 7]))
     assert some.original.tolist() == [0, 1, 2, 1]
