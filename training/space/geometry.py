@@ -62,9 +62,10 @@ HOPEFUL = 1.2
 REACHED = 2 / 3
 #: Below this number of shapes, maps are also compared with half as many modes: single shapes decide less then.
 FEW = 20
-#: Shares of the variance that local fields may add to the modes of the chosen map, the smallest first. The next one is
-#: tried until held-out shapes are certainly farther away.
-LOCAL_SHARES = (0.01, 0.03, 0.1, 0.3)
+#: Shares of the variance that local fields may add to the modes of the chosen map. The next one is tried until held-out
+#: shapes are certainly farther away. Unless more than the first is best, smaller ones follow: of many modes, the last
+#: have little variance themselves.
+LOCAL_SHARES, SMALLER_SHARES = (0.01, 0.03, 0.1, 0.3), (0.003, 0.001)
 #: Folds end once the differences between the errors of the chosen map and of the others are this number of standard
 #: errors from changing the choice, with at least this number of shapes.
 CERTAIN, ENOUGH = 3, 8
@@ -355,17 +356,24 @@ class _Comparison:
 
     def _local_share(self, chosen: _Map) -> tuple[float, float]:
         """Return the share of local fields with the least error on held-out shapes, and by how much it lowers it."""
-        best, gain = 0.0, 0.0
         try:
-            for share in LOCAL_SHARES:
-                ours, theirs = self._compared(chosen, share, best)
-                if _certainly_positive(ours - theirs):
-                    break
-                if ours.mean() < theirs.mean():
-                    best, gain = share, 1 - (1 - gain) * float(ours.mean() / theirs.mean())
+            best = self._best_share(chosen, LOCAL_SHARES, 0.0)
+            if best <= LOCAL_SHARES[0]:
+                best = self._best_share(chosen, SMALLER_SHARES, best)
+            ours, theirs = self._compared(chosen, best, 0.0)
         except (ModeError, NotPositiveDefiniteError):  # the map fails without some of the shapes
             return 0.0, 0.0
-        return best, gain
+        return best, 1 - float(ours.mean() / theirs.mean())
+
+    def _best_share(self, chosen: _Map, shares: Sequence[float], best: float) -> float:
+        """Return the best of some shares and of the best so far. They end where shapes are certainly farther away."""
+        for share in shares:
+            ours, theirs = self._compared(chosen, share, best)
+            if _certainly_positive(ours - theirs):
+                break
+            if ours.mean() < theirs.mean():
+                best = share
+        return best
 
     def _compared(self, chosen: _Map, share: float, other: float) -> tuple[FloatArray, FloatArray]:
         """Return distances (n,) of held-out shapes with two shares of local fields.

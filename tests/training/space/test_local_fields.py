@@ -1,5 +1,6 @@
 """Local fields: modes that the shapes of a collection have in single regions."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,22 @@ def test_local_fields_come_where_they_help(limbs: tuple[TriangleMesh, FloatArray
     codes = np.random.default_rng(1).uniform(-0.05, 0.05, (20, 3))
     global_ = x + np.einsum("nk,kvj->nvj", codes, np.stack([np.sin(x * k) for k in (1, 2, 3)]))
     assert choose_geometry(ModeSettings(geometry="vertices", count=3), rest, global_, Material()).local_share == 0
+
+
+def test_many_modes_take_a_small_share_of_local_fields(limbs: tuple[TriangleMesh, FloatArray]) -> None:
+    """Sizes vary much more than limbs, so the weak modes have little variance. As much from local fields is enough."""
+    rest, poses = limbs
+    sizes = np.exp(np.random.default_rng(1).uniform(-0.5, 0.5, len(poses)))[:, None, None]
+    known, unseen = np.split(sizes * (rest.vertices + 0.05 * (poses - rest.vertices)), [20])
+    choice = choose_geometry(ModeSettings(geometry="vertices", count=13), rest, known, Material())
+    assert 0 < choice.local_share < 0.01
+    assert choice.local_gain > 0.02
+
+    def error(share: float) -> float:
+        lines = straight_lines(replace(choice, local_share=share), known, rest).first(13)
+        return float(vertex_distances(lines.nearest(unseen).vertices, unseen, rest.diagonal).mean())
+
+    assert error(choice.local_share) < min(0.97 * error(0.0), error(0.01))
 
 
 @pytest.mark.parametrize("kind", ["vertices", "nric", "differential"])
