@@ -207,7 +207,7 @@ def people_section(found: dict[str, Any]) -> str:
     """Return the section about people."""
     cells: list[list[str]] = []
     ratios: dict[str, list[str]] = {}
-    for what in filter(found.__contains__, LEFT_OUT):
+    for what in LEFT_OUT:
         every = [found[what]["auto"], *found[what]["many"]]
         for k, row in enumerate(every):
             shares = {kind: row[kind]["mean"] / row["components"]["mean"] for kind in ("modes", *SIMPLE) if kind in row}
