@@ -194,7 +194,10 @@ def _files_of_subjects(folder: Path, file: str) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     for subject in sorted(_folders(folder), key=lambda path: natural_order(path.name)):
         named = subject / file
-        matching = [named] if named.is_file() else [p for p in subject.glob(file) if p.is_file()]
+        if named.is_file():  # also where the name looks like a pattern
+            found[subject.name] = [named]
+            continue
+        matching = [p for p in subject.glob(file) if p.is_file()]
         if not matching:
             found[subject.name] = []
         for path in sorted(matching, key=lambda path: natural_order(path.as_posix())):

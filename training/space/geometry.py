@@ -268,10 +268,10 @@ class _Comparison:
         self._settings, self._reference, self._shapes, self._material = settings, reference, shapes, material
         self._related, self._among, self._vary = related, among, vary
         used = related.spread(CHOICE_SHAPES)
-        self._some, self._relations = shapes[used], related.some(used)
+        self._some, self._some_related = shapes[used], related.some(used)
         self._steps, self._first_step = _many(settings, first_step), first_step
         self._light = min(LIGHT_STEPS, self._steps)
-        self._folds = self._relations.folds()
+        self._folds = self._some_related.folds()
         self._parts: dict[tuple[Kind, int], _Part] = {}
         self._measured: dict[tuple[Kind, int, int, float], FloatArray] = {}
 
@@ -283,9 +283,9 @@ class _Comparison:
                 maps[kind] = self._map(kind)
         if not maps:  # the stages that need a mean report it
             return GeometryChoice("exponential", self._steps)
-        supported = (len(self._relations.without(index)) - 1 for index in self._folds)
+        supported = (len(self._some_related.without(index)) - 1 for index in self._folds)
         count = max(1, min(*(each.own.supported for each in maps.values()), *supported))
-        counts = sorted({count, -(-count // 2)}) if self._relations.originals < FEW else [count]
+        counts = sorted({count, -(-count // 2)}) if self._some_related.originals < FEW else [count]
         straight = maps["vertices"].lines if "vertices" in maps else None
         folded = self._folded(straight.first(min(count, FOLDED_MODES))) if straight else 0.0
         away: dict[Kind, FloatArray] = {kind: np.empty(0) for kind in maps}
@@ -323,7 +323,7 @@ class _Comparison:
         if kind == "exponential":
             # They must reach enough shapes.
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
-            own, (space, mean, fields) = mode_count(self._settings, *at, self._relations), at
+            own, (space, mean, fields) = mode_count(self._settings, *at, self._some_related), at
             centre = self._reference.with_vertices(mean)
 
             def exponentials(kept: IntArray, index: IntArray) -> _Part:
@@ -347,11 +347,11 @@ class _Comparison:
         steps, count = (self._steps, None) if chosen.kind == "exponential" else (1, own.count)
         if own.local:
             return GeometryChoice(chosen.kind, steps, count, local_share=own.local.share, unseen_share=own.local.unseen)
-        share, gain = self._local_share(chosen) if self._vary and self._relations.groups >= FOLDS else (0.0, 0.0)
+        share, gain = self._local_share(chosen) if self._vary and self._some_related.groups >= FOLDS else (0.0, 0.0)
         if not share:
             return GeometryChoice(chosen.kind, steps, count)
-        left = left_of_held_out(chosen.rows @ chosen.rows.T, self._relations)
-        unseen = unseen_share(left, self._relations)
+        left = left_of_held_out(chosen.rows @ chosen.rows.T, self._some_related)
+        unseen = unseen_share(left, self._some_related)
         return GeometryChoice(chosen.kind, steps, count, local_share=share, unseen_share=unseen, local_gain=gain)
 
     def _local_share(self, chosen: _Map) -> tuple[float, float]:
@@ -382,7 +382,7 @@ class _Comparison:
         """
         away = np.empty((0, 2))
         for fold, index in enumerate(self._folds):
-            count = max(1, min(chosen.own.count, self._relations.originals - len(index) - 1))
+            count = max(1, min(chosen.own.count, self._some_related.originals - len(index) - 1))
             both = np.stack([self._distances(chosen, fold, count, each) for each in (share, other)], axis=1)
             away = np.concatenate([away, both])
             gaps = away[:, 0] - away[:, 1]
@@ -396,7 +396,7 @@ class _Comparison:
         if key not in self._measured:
             index = self._folds[fold]
             if (chosen.kind, fold) not in self._parts:
-                self._parts[chosen.kind, fold] = chosen.without(self._relations.without(index), index)
+                self._parts[chosen.kind, fold] = chosen.without(self._some_related.without(index), index)
             near = self._parts[chosen.kind, fold].nearest(self._some[index], count, share)
             self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
         return self._measured[key]

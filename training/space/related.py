@@ -59,6 +59,11 @@ class Related:
         return self.group[np.where(self.original < 0, ~self.original, self.original)]
 
     @property
+    def _inner_parts(self) -> int:
+        """Number of inner folds."""
+        return min(INNER_FOLDS, self.groups)
+
+    @property
     def few(self) -> bool:
         """Whether each group is held out by itself, because there are few shapes."""
         return self.originals < 2 * FOLDS
@@ -88,9 +93,9 @@ class Related:
 
         Local fields of the shapes that are held out are neither held out nor kept.
         """
-        parts = min(INNER_FOLDS, self.groups)
-        fold, own = self._of_rows % parts, self.original >= 0
-        return [(np.flatnonzero(own & (fold == part)), np.flatnonzero(fold != part)) for part in range(parts)]
+        fold, own = self._of_rows % self._inner_parts, self.original >= 0
+        parts = range(self._inner_parts)
+        return [(np.flatnonzero(own & (fold == part)), np.flatnonzero(fold != part)) for part in parts]
 
     @property
     def most_modes(self) -> int:
@@ -98,7 +103,7 @@ class Related:
 
         A mirror image adds no shape, so it supports no further mode.
         """
-        held = np.bincount(self.group % min(INNER_FOLDS, self.groups)).max()
+        held = np.bincount(self.group % self._inner_parts).max()
         return max(1, self.originals - int(held) - 1)
 
     def with_local(self, local: FloatArray) -> Related:

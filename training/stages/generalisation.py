@@ -18,8 +18,9 @@ def measure_generalisation(run: Run) -> None:
 
     A fifth of the shapes is left out of mean, logarithms, modes and their number, and of the choice of the map. Maps
     that were clearly worse on all shapes are not compared again, nor local fields that did not help. Below ten shapes,
-    each shape is left out in its turn. Exponentials stand for networks, in at most LIGHT_STEPS steps. The space
-    remembers the other shapes if the bundle does. The same is measured with half as many modes.
+    each is left out in its turn. Related shapes are left out together. Exponentials stand for networks, in at most
+    LIGHT_STEPS steps. The space remembers the other shapes if the bundle does. The same is measured with half as many
+    modes.
     ``least-general.npz`` has the shape with the largest error.
     """
     directory, material = run.directory, run.config.shell_material

@@ -165,6 +165,10 @@ def test_subjects_may_have_a_folder_for_each_session(tmp_path: Path) -> None:
     for file in ("ses-*/surf/pial.ply", "*/*/pial.ply", "**/pial.ply"):
         ending = "" if file.startswith("ses") else "_surf"
         assert list(read_collection(study, file=file).names) == [name + ending for name in names]
+    for k in range(3):
+        write(tmp_path / "plain" / f"P{k}" / "scan [final]" / "mesh.ply", ball(k))
+    plain = read_collection(tmp_path / "plain", file="scan [final]/mesh.ply")
+    assert list(plain.names) == ["P0", "P1", "P2"], "a folder's own name, although it looks like a pattern"
     write(study / "sub-01" / "ses-1" / "surf" / "white.ply", ball(1))
     with pytest.raises(IngestError, match=re.escape(f"{Path('sub-01/ses-1/surf')}: has 2 files ses-*/surf/*.ply")):
         read_collection(study, file="ses-*/surf/*.ply")
