@@ -32,11 +32,12 @@ from shapespace.training.space.generalisation import (
     time_steps,
     vertex_distances,
 )
-from shapespace.training.space.local_fields import LocalVariation, local_fields, scale_of
+from shapespace.training.space.local_fields import LOCAL_SHARE, LocalVariation, local_fields, scale_of
 from shapespace.training.space.modes import (
     FEWEST,
     ModeCount,
     ModeError,
+    count_with_local,
     left_of_held_out,
     mode_count,
     unseen_share,
@@ -77,7 +78,7 @@ class GeometryChoice:
 
     kind: Kind
     steps: int  # K of exponentials, 1 for straight lines
-    count: int | None = None  # number of modes of straight lines
+    count: int | None = None  # number of modes, of exponentials only where local fields change it
     compared: int | None = None  # number of modes of all maps in the comparison
     held_out: int = 0  # number of shapes in the comparison
     # mean distance of each map from these shapes, as a share of the diagonal
@@ -246,6 +247,7 @@ class _Map:
 
     kind: Kind
     own: ModeCount
+    mean: TriangleMesh
     rows: FloatArray  # (n, 3V) motions of vertices from the mean to the shapes that are compared
     without: Callable[[IntArray, IntArray], _Part]  # from indices of the shapes that are kept, and of the others
     lines: StraightLines | None = None
@@ -329,7 +331,7 @@ class _Comparison:
             def exponentials(kept: IntArray, index: IntArray) -> _Part:
                 return _ExponentialsPart(centre, space, fields[kept], fields[index], self._light)
 
-            return _Map(kind, own, fields.reshape(len(fields), -1), exponentials)
+            return _Map(kind, own, centre, fields.reshape(len(fields), -1), exponentials)
 
         def straight(kept: IntArray, _: IntArray) -> _Part:
             others = self._some[kept]
@@ -339,7 +341,7 @@ class _Comparison:
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)
         own = straight_count(self._settings, lines, self._shapes, self._related)
-        return _Map(kind, own, lines.motions(self._some), straight, lines)
+        return _Map(kind, own, lines.reference, lines.motions(self._some), straight, lines)
 
     def _chosen(self, chosen: _Map) -> GeometryChoice:
         """Return the choice of a map, with the share of local fields in its modes."""
@@ -347,43 +349,56 @@ class _Comparison:
         steps, count = (self._steps, None) if chosen.kind == "exponential" else (1, own.count)
         if own.local:
             return GeometryChoice(chosen.kind, steps, count, local_share=own.local.share, unseen_share=own.local.unseen)
-        share, gain = self._local_share(chosen) if self._vary and self._some_related.groups >= FOLDS else (0.0, 0.0)
-        if not share:
+        if not self._vary or self._some_related.groups < FOLDS:
             return GeometryChoice(chosen.kind, steps, count)
         left = left_of_held_out(chosen.rows @ chosen.rows.T, self._some_related)
         unseen = unseen_share(left, self._some_related)
+        # Compared with as many modes as local fields ask for: of few modes, they would replace better ones.
+        share, gain = self._local_share(chosen, self._count(chosen, LOCAL_SHARE * unseen))
+        if not share:
+            return GeometryChoice(chosen.kind, steps, count)
+        if self._settings.count == "auto":
+            count = self._count(chosen, share)
         return GeometryChoice(chosen.kind, steps, count, local_share=share, unseen_share=unseen, local_gain=gain)
 
-    def _local_share(self, chosen: _Map) -> tuple[float, float]:
+    def _count(self, chosen: _Map, share: float) -> int:
+        """Return the number of modes of a map with a share of local fields."""
+        if self._settings.count != "auto":
+            return chosen.own.count
+        local = local_fields(chosen.mean, chosen.rows.reshape(len(chosen.rows), -1, 3))
+        more = count_with_local(chosen.rows, local, share, self._some_related)
+        return max(chosen.own.count, min(more, self._some_related.originals - 1))
+
+    def _local_share(self, chosen: _Map, count: int) -> tuple[float, float]:
         """Return the share of local fields with the least error on held-out shapes, and by how much it lowers it."""
         try:
-            best = self._best_share(chosen, LOCAL_SHARES, 0.0)
+            best = self._best_share(chosen, count, LOCAL_SHARES, 0.0)
             if best <= LOCAL_SHARES[0]:
-                best = self._best_share(chosen, SMALLER_SHARES, best)
-            ours, theirs = self._compared(chosen, best, 0.0)
+                best = self._best_share(chosen, count, SMALLER_SHARES, best)
+            ours, theirs = self._compared(chosen, count, best, 0.0)
         except (ModeError, NotPositiveDefiniteError):  # the map fails without some of the shapes
             return 0.0, 0.0
         return best, 1 - float(ours.mean() / theirs.mean())
 
-    def _best_share(self, chosen: _Map, shares: Sequence[float], best: float) -> float:
+    def _best_share(self, chosen: _Map, count: int, shares: Sequence[float], best: float) -> float:
         """Return the best of some shares and of the best so far. They end where shapes are certainly farther away."""
         for share in shares:
-            ours, theirs = self._compared(chosen, share, best)
+            ours, theirs = self._compared(chosen, count, share, best)
             if _certainly_positive(ours - theirs):
                 break
             if ours.mean() < theirs.mean():
                 best = share
         return best
 
-    def _compared(self, chosen: _Map, share: float, other: float) -> tuple[FloatArray, FloatArray]:
+    def _compared(self, chosen: _Map, count: int, share: float, other: float) -> tuple[FloatArray, FloatArray]:
         """Return distances (n,) of held-out shapes with two shares of local fields.
 
         Folds end once it is certain which is smaller.
         """
         away = np.empty((0, 2))
         for fold, index in enumerate(self._folds):
-            count = max(1, min(chosen.own.count, self._some_related.originals - len(index) - 1))
-            both = np.stack([self._distances(chosen, fold, count, each) for each in (share, other)], axis=1)
+            few = max(1, min(count, self._some_related.originals - len(index) - 1))
+            both = np.stack([self._distances(chosen, fold, few, each) for each in (share, other)], axis=1)
             away = np.concatenate([away, both])
             gaps = away[:, 0] - away[:, 1]
             if len(away) >= ENOUGH and (_certainly_positive(gaps) or _certainly_positive(-gaps)):

@@ -147,13 +147,22 @@ def worthwhile_with_local(
     share = LOCAL_SHARE * unseen
     if share < NEGLIGIBLE:
         return ModeCount(count, count)
-    others = local()
-    flat = others.reshape(-1, rows.shape[1]) * root
-    every = np.concatenate([rows, scale_of(flat, rows, share) * flat])
-    left = left_of_held_out(every @ every.T, related.with_local(others))[:n]
-    more = worthwhile(left, len(every) - 1)
+    more = count_with_local(rows, local(), share, related, root)
     # As long as there are modes of the data, these are better.
     return ModeCount(more, count, LocalVariation(share, unseen)) if more >= n else ModeCount(count, count)
+
+
+def count_with_local(
+    rows: FloatArray, local: FloatArray, share: float, related: Related, root: FloatArray | float = 1.0
+) -> int:
+    """Return the number of modes that pay for rows (n, 3V), where local fields (n, k, V, 3) add a share of variance.
+
+    ``root`` are square roots (3V,) of weights that the rows have, and the fields have not.
+    """
+    flat = local.reshape(-1, rows.shape[1]) * root
+    every = np.concatenate([rows, scale_of(flat, rows, share) * flat])
+    left = left_of_held_out(every @ every.T, related.with_local(local))[: len(rows)]
+    return worthwhile(left, len(every) - 1)
 
 
 def unseen_share(left: FloatArray, related: Related) -> float:

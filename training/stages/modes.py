@@ -36,8 +36,10 @@ def decompose(run: Run) -> None:
     steps = directory.log_steps()
     found = logarithms(space, centre.vertices, shapes, steps)
     own = mode_count(settings, space, centre.vertices, found.fields, related)
-    chosen = directory.geometry.read_if_written()
-    count, local = own.count, own.local or (GeometryChoice(**chosen).local if chosen else None)
+    count, local = own.count, own.local
+    if local is None and (written := directory.geometry.read_if_written()):
+        chosen = GeometryChoice(**written)
+        count, local = chosen.count or count, chosen.local
     plain = settings.model_copy(update={"sparsity": 0})
     dense, sparse = (
         find_modes(each, space, centre.vertices, found.fields, count, related, local.share if local else 0.0)

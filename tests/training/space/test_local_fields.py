@@ -99,7 +99,11 @@ def test_no_more_modes_than_asked_for_or_than_shapes(ellipsoid: TriangleMesh, wa
 @pytest.fixture(scope="module")
 def limbs() -> tuple[TriangleMesh, FloatArray]:
     """Limbs that move by themselves, in 32 poses (n, V, 3): a few show how they move, but not in all combinations."""
-    poses = figure.pose(np.random.default_rng(0).uniform(-0.6, 0.6, (32, len(figure.ANGLES))))
+    return _limbs(32)
+
+
+def _limbs(count: int) -> tuple[TriangleMesh, FloatArray]:
+    poses = figure.pose(np.random.default_rng(0).uniform(-0.6, 0.6, (count, len(figure.ANGLES))))
     coarse = coarsen(figure.rest(), 400, poses[:4])
     rest = TriangleMesh.from_arrays(figure.rest().vertices[coarse.fine_index], coarse.faces)
     return rest, poses[:, coarse.fine_index]
@@ -137,6 +141,19 @@ def test_local_fields_come_where_they_help(limbs: tuple[TriangleMesh, FloatArray
     codes = np.random.default_rng(1).uniform(-0.05, 0.05, (20, 3))
     global_ = x + np.einsum("nk,kvj->nvj", codes, np.stack([np.sin(x * k) for k in (1, 2, 3)]))
     assert choose_geometry(ModeSettings(geometry="vertices", count=3), rest, global_, Material()).local_share == 0
+
+
+def test_local_fields_bring_further_modes() -> None:
+    rest, poses = _limbs(48)
+    known, unseen = np.split(poses, [36])
+    auto = ModeSettings(geometry="differential")
+    choices = [choose_geometry(auto, rest, known, Material(), vary=vary) for vary in (True, False)]
+    ours, plain = (straight_lines(each, known, rest).first(each.count or 0) for each in choices)
+    assert len(plain) < len(ours) < len(known)
+    errors = [vertex_distances(each.nearest(unseen).vertices, unseen, rest.diagonal).mean() for each in (ours, plain)]
+    assert errors[0] < 0.8 * errors[1]
+    asked = ModeSettings(geometry="differential", count=24)
+    assert choose_geometry(asked, rest, known, Material()).count == 24
 
 
 def test_many_modes_take_a_small_share_of_local_fields(limbs: tuple[TriangleMesh, FloatArray]) -> None:
