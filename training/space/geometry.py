@@ -121,7 +121,7 @@ def choose_geometry(
     modes may cost at most 2 % more. They are left out if many shapes have no geodesic from the mean.
 
     If modes may ``vary``, the same folds then choose how much of the variance of its modes comes from local fields,
-    unless the number of modes needs them anyway.
+    unless the number of modes needs them anyway. If ``modes.count`` is "auto", the modes are then counted again.
 
     Shapes that are ``related`` are held out together; by default none are. ``among`` are the maps that "auto" compares,
     in the order of their cost. A single one is not compared.
@@ -252,6 +252,11 @@ class _Map:
     without: Callable[[IntArray, IntArray], _Part]  # from indices of the shapes that are kept, and of the others
     lines: StraightLines | None = None
 
+    @cached_property
+    def local(self) -> FloatArray:
+        """Local fields (n, k, V, 3) of the shapes that are compared."""
+        return local_fields(self.mean, self.rows.reshape(len(self.rows), -1, 3))
+
 
 class _Comparison:
     """Errors of all maps on the same held-out shapes."""
@@ -365,8 +370,7 @@ class _Comparison:
         """Return the number of modes of a map with a share of local fields."""
         if self._settings.count != "auto":
             return chosen.own.count
-        local = local_fields(chosen.mean, chosen.rows.reshape(len(chosen.rows), -1, 3))
-        more = count_with_local(chosen.rows, local, share, self._some_related)
+        more = count_with_local(chosen.rows, chosen.local, share, self._some_related)
         return max(chosen.own.count, min(more, self._some_related.originals - 1))
 
     def _local_share(self, chosen: _Map, count: int) -> tuple[float, float]:

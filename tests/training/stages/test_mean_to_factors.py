@@ -1,5 +1,6 @@
 """The stages: where a collection has no mean the message names the place, and steps are chosen with the mean."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from shapespace.mesh.rigid_motion import align
 from shapespace.mesh.triangle_mesh import TriangleMesh
 from shapespace.training.runs.config import parse
 from shapespace.training.space.factors import FactorError
+from shapespace.training.space.geometry import GeometryChoice
 from shapespace.training.stages.ingest import write_reference
 from shapespace.training.stages.mean import MeanError, find_mean
 from shapespace.training.stages.run import STAGES
@@ -87,3 +89,24 @@ def test_codes_of_a_run_stand_for_exponentials_of_the_steps_that_were_chosen(
     run = Run(tmp_path, parse(source, "balls.toml"), source, tmp_path / "models")
     with pytest.raises(FactorError, match=r"export.names has 'head', .* There are \".*\", \""):
         STAGES["factors"].run(run)
+
+
+def test_modes_have_the_number_and_the_local_fields_that_were_chosen_for_exponentials(
+    blends: tuple[TriangleMesh, np.ndarray], tmp_path: Path
+) -> None:
+    mesh, shapes = blends
+    source = CONFIG + "[modes]\nsparsity = 0\nlog_steps = 1\n"
+    run = Run(tmp_path, parse(source, "balls.toml"), source, tmp_path / "models")
+    write_reference(run.directory, mesh, 10.0)
+    names = np.arange(len(shapes)).astype(str)
+    run.directory.shapes.write(names=names, vertices=shapes, original=np.arange(len(shapes)))
+    STAGES["mean"].run(run)
+    STAGES["modes"].run(run)
+    alone = run.directory.decomposition.read()
+    assert alone["local_share"] == 0
+    more = alone["modes"] + 2
+    chosen = GeometryChoice("exponential", 1, more, local_share=0.1, unseen_share=0.1)
+    run.directory.geometry.write(asdict(chosen))
+    STAGES["modes"].run(run)
+    found = run.directory.decomposition.read()
+    assert (found["modes"], found["local_share"]) == (more, 0.1)
