@@ -113,7 +113,7 @@ class ModeSettings(SettingsTable):
 
     count: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Number of modes m, less than the number of shapes. ``auto`` minimises the relative error of held-out shapes plus
-    0.5 % for each mode. For few shapes it adds modes of single regions."""
+    0.5 % for each mode. It may add modes that move single regions."""
     geometry: Literal["auto", "vertices", "nric", "differential", "exponential"] = "exponential"
     """The map from codes to shapes; ``init`` writes ``auto``. ``exponential`` bends an elastic shell. The others are
     straight lines: ``vertices`` like blend shapes, ``nric`` (lengths and angles) so that limbs bend, ``differential``
