@@ -20,7 +20,7 @@ from shapespace.shell.space import FirstStep, ShellSpace
 from shapespace.solve.cholesky import NotPositiveDefiniteError
 from shapespace.solve.outcome import Status
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.codes import box_of, nearest_codes
+from shapespace.training.space.codes import box_of, exponential_map, nearest_codes
 from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.mean import centred_mean
 from shapespace.training.space.modes import ModeError, coefficients, pga
@@ -181,7 +181,7 @@ def nearest_exponentials(
 
     ``towards`` (k, V, 3) are the logarithms of the shapes. The mean (V, 3) may be the mean of all of them. So that
     modes know nothing of the shapes, they are principal modes about the mean of the other logarithms, from which they
-    lead. ``local`` fields (…, V, 3) may join these.
+    lead. ``local`` fields (…, V, 3) may join these. Raises ModeError if that mean has no exponential.
     """
     centre = fields.mean(axis=0)
     some = fields - centre
@@ -189,6 +189,8 @@ def nearest_exponentials(
         some = np.concatenate([some, local.reshape(-1, *mean.shape)])
     modes = pga(space, mean, some, count, "vertices").vertices
     start, _ = coefficients(space, mean, towards - centre, modes, "vertices")
+    if exponential_map(space, mean, modes, steps, centre)(np.zeros(len(modes))) is None:
+        raise ModeError("the mean of the logarithms of the shapes that are not held out has no exponential")
     return nearest_codes(space, mean, modes, shapes, start, steps, centre=centre).vertices
 
 

@@ -18,6 +18,7 @@ from shapespace.training.space.generalisation import (
     vertex_distances,
 )
 from shapespace.training.space.held_out import held_out
+from shapespace.training.space.modes import ModeError
 from tests.training.conftest import STEPS, bent
 
 
@@ -65,6 +66,16 @@ def test_modes_lead_from_the_mean_of_the_other_logarithms(ellipsoid):
     rest = (last - others[0]).ravel()
     rest = rest - known @ np.linalg.lstsq(known, rest)[0]
     assert away[0] == pytest.approx(np.linalg.norm(rest.reshape(-1, 3), axis=1).mean() / ellipsoid.diagonal, rel=0.05)
+
+
+def test_no_search_begins_where_the_mean_of_the_others_has_no_exponential(ellipsoid):
+    x = ellipsoid.vertices
+    moved = np.random.default_rng(0).standard_normal((2, 4, *x.shape))
+    space = ShellSpace(ellipsoid, Material(), first_step="centred")
+    small = nearest_exponentials(space, x, 1e-3 * moved[0], 1e-3 * moved[1], x + 1e-3 * moved[1], 2, 4)
+    assert small.shape == moved[1].shape
+    with pytest.raises(ModeError, match="has no exponential"):
+        nearest_exponentials(space, x, 30 * moved[0], 30 * moved[1], x + 30 * moved[1], 2, 4)
 
 
 def test_one_step_is_chosen_where_shapes_neither_bend_nor_fold(ellipsoid, shapes, blends):
