@@ -60,8 +60,6 @@ models](generalisation.md#stronger-simple-models). Empty cells: there are too fe
 - Each draw chooses its [map](../explanation/choosing.md#map-from-codes-to-shapes) and its number of modes by itself
   (see `runs/few-shapes.json`). The simple models have the same coarse meshes and as many modes, but at most one less
   than shapes: there are no more.
-- From 10 shapes of makehuman, figures are older: held-out shapes still [showed through the
-  mean](../../benchmarks/NOTES.md#local-fields).
 - Exponentials are exact here. Networks add an error of their own, see [unseen shapes](served.md).
 - `python -m benchmarks.few_shapes --data FOLDER` measures and writes this page. {measured}
 """
