@@ -7,11 +7,10 @@ from math import comb
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import align, without_rigid_motion
+from shapespace.shell.coupling import coupling, factorised
 from shapespace.shell.space import TOLERANCE, ChordSolver, DiscretePath, ShellPoint, ShellSpace, fault_between
 from shapespace.solve.anderson import Anderson
 from shapespace.solve.cholesky import NotPositiveDefiniteError
@@ -253,15 +252,10 @@ class _Step:
         return self.current.pull_back(covector + self._known)
 
     def derivative(self, unknown: ShellPoint) -> sparse.csc_array:
-        """Compute ``DF(X)`` (3V, 3V), close to −A and not symmetric, regularised on rigid motions."""
-        matrix = self.current.space.jacobian.matrix
-        here, there = matrix(self.current.gradients), matrix(unknown.gradients)
+        """Compute ``DF(X)`` (3V, 3V)."""
         if self._forward:
-            derivative = here.T @ self.current.rest.mixed_hessian(unknown.z) @ there
-        else:
-            derivative = here.T @ unknown.rest.mixed_hessian(self.current.z).T @ there
-        shift = NormalMatrix.REGULARISATION * derivative.diagonal().mean()
-        return sparse.csc_array(derivative + shift * sparse.eye_array(derivative.shape[0]))
+            return coupling(self.current, unknown)
+        return sparse.csc_array(coupling(unknown, self.current).T)
 
 
 class _CentredStep:
@@ -345,7 +339,7 @@ def _newton(equation: _Equation, chord: ChordSolver, tolerance: float) -> _Solut
         if iteration == NEWTON_STEPS:
             break
         try:
-            step = -splu(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
+            step = -factorised(equation.derivative(point)).solve(forces.ravel()).reshape(-1, 3)
         except RuntimeError:
             return _stalled(point, iteration, residual, "the derivative is singular")
         found = _line_search(equation, chord, point, step, residual)

@@ -4,11 +4,11 @@ from typing import Literal
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 
 from shapespace.arrays import FloatArray
-from shapespace.coordinates.normal_matrix import NormalMatrix
 from shapespace.mesh.rigid_motion import rigid_motions, without_rigid_motion
+from shapespace.shell.coupling import coupling, factorised
 from shapespace.shell.space import DiscretePath, ShellPoint
 
 
@@ -48,10 +48,10 @@ class ExponentialDerivative:
         self._here: list[sparse.csc_array] = []  # C_k
         self._factors: list[SuperLU] = []
         for previous, current, following in zip(points, points[1:], points[2:], strict=False):
-            ahead = _coupling(current, following)
+            ahead = coupling(current, following)
             self._ahead.append(ahead)
             self._here.append(_stiffness(previous, current, following))
-            self._factors.append(_factorised(ahead))
+            self._factors.append(factorised(ahead))
         self._first = None if path.before is None else _CentredStep(path, path.before)
 
     def push_forward(self, velocities: FloatArray) -> FloatArray:
@@ -91,9 +91,9 @@ class _CentredStep:
         self._start = path.vertices[0]
         self._following = 2 * path.vertices[1] - 2 * self._start + before
         start = path.space.point(self._start)
-        self._behind = _coupling(path.space.point(before), start)
-        self._ahead = _coupling(start, path.space.point(self._following))
-        self._factor = _factorised(self._ahead)
+        self._behind = coupling(path.space.point(before), start)
+        self._ahead = coupling(start, path.space.point(self._following))
+        self._factor = factorised(self._ahead)
         self._here, self._there = rigid_motions(self._start), rigid_motions(self._following)
 
     def push_forward(self, strides: FloatArray) -> FloatArray:
@@ -116,17 +116,6 @@ def _projected(fields: FloatArray, along: FloatArray, onto: FloatArray) -> Float
     flat = fields.reshape(len(fields), -1)
     shares = np.linalg.solve(onto @ along.T, onto @ flat.T)
     return (flat - shares.T @ along).reshape(fields.shape)
-
-
-def _factorised(matrix: sparse.csc_array) -> SuperLU:
-    """Factorise ``D_k``, regularised on rigid motions.
-
-    The matrix is close to −A, which is definite. So no pivoting is needed, and the ordering is for symmetric patterns.
-    """
-    shift = NormalMatrix.REGULARISATION * matrix.diagonal().mean() * sparse.eye_array(matrix.shape[0])
-    mode = {"SymmetricMode": True}
-    regular = sparse.csc_array(matrix + shift)
-    return splu(regular, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=mode)
 
 
 def _solve(
@@ -152,13 +141,6 @@ def _solve(
 def _apply(matrix: sparse.csc_array | sparse.csr_array, fields: FloatArray) -> FloatArray:
     product: FloatArray = np.asarray(matrix @ fields.reshape(len(fields), -1).T)
     return product.T.reshape(fields.shape)
-
-
-def _coupling(current: ShellPoint, following: ShellPoint) -> sparse.csc_array:
-    """Compute ``D_k`` (3V, 3V)."""
-    matrix = current.space.jacobian.matrix
-    hessian = current.rest.mixed_hessian(following.z)
-    return sparse.csc_array(matrix(current.gradients).T @ hessian @ matrix(following.gradients))
 
 
 def _stiffness(previous: ShellPoint, current: ShellPoint, following: ShellPoint) -> sparse.csc_array:
