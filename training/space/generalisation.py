@@ -175,23 +175,47 @@ def nearest_exponentials(
     shapes: FloatArray,
     count: int,
     steps: int,
-    local: FloatArray | None = None,
 ) -> FloatArray:
     """Return the exponentials (k, V, 3) nearest to shapes (k, V, 3), along modes of the logarithms (n, V, 3) of others.
 
-    ``towards`` (k, V, 3) are the logarithms of the shapes. The mean (V, 3) may be the mean of all of them. So that
-    modes know nothing of the shapes, they are principal modes about the mean of the other logarithms, from which they
-    lead. ``local`` fields (…, V, 3) may join these. Raises ModeError if that mean has no exponential.
+    ``towards`` (k, V, 3) are the logarithms of the shapes. The mean (V, 3) may be the mean of all of them. Exponentials
+    lead from the mean of the other logarithms, see `ModesOfOthers`. Raises ModeError if that mean has no exponential.
     """
-    centre = fields.mean(axis=0)
-    some = fields - centre
-    if local is not None:
-        some = np.concatenate([some, local.reshape(-1, *mean.shape)])
-    modes = pga(space, mean, some, count, "vertices").vertices
-    start, _ = coefficients(space, mean, towards - centre, modes, "vertices")
+    others = ModesOfOthers.of(space, mean, fields, count)
+    modes, centre = others.vertices, others.centre
+    start = others.codes(towards)
     if exponential_map(space, mean, modes, steps, centre)(np.zeros(len(modes))) is None:
         raise ModeError("the mean of the logarithms of the shapes that are not held out has no exponential")
     return nearest_codes(space, mean, modes, shapes, start, steps, centre=centre).vertices
+
+
+@dataclass(frozen=True, eq=False)
+class ModesOfOthers:
+    """Principal modes of the logarithms of some shapes, about their mean. So they know nothing of other shapes."""
+
+    space: ShellSpace
+    mean: FloatArray  # (V, 3) where the logarithms are, which may be the mean of more shapes
+    centre: FloatArray  # (V, 3) mean of the logarithms
+    vertices: FloatArray  # (m, V, 3) modes
+
+    @classmethod
+    def of(
+        cls, space: ShellSpace, mean: FloatArray, fields: FloatArray, count: int, local: FloatArray | None = None
+    ) -> ModesOfOthers:
+        """Find the modes of logarithms (n, V, 3). ``local`` fields (…, V, 3) may join these."""
+        centre = fields.mean(axis=0)
+        some = fields - centre
+        if local is not None:
+            some = np.concatenate([some, local.reshape(-1, *mean.shape)])
+        return cls(space, mean, centre, pga(space, mean, some, count, "vertices").vertices)
+
+    def codes(self, fields: FloatArray) -> FloatArray:
+        """Return the codes (k, m) nearest to logarithms (k, V, 3) in the tangent space."""
+        return coefficients(self.space, self.mean, fields - self.centre, self.vertices, "vertices")[0]
+
+    def left(self, fields: FloatArray) -> FloatArray:
+        """Return what the modes leave (k, V, 3) of logarithms (k, V, 3)."""
+        return fields - self.centre - np.tensordot(self.codes(fields), self.vertices, axes=1)
 
 
 def _missed(

@@ -26,6 +26,7 @@ from shapespace.training.space.generalisation import (
     FOLDED_SHAPES,
     FOLDED_SHARE,
     LIGHT_STEPS,
+    ModesOfOthers,
     many_steps,
     nearest_exponentials,
     space_of,
@@ -121,7 +122,8 @@ def choose_geometry(
     modes may cost at most 2 % more. They are left out if many shapes have no geodesic from the mean.
 
     If modes may ``vary``, the same folds then choose how much of the variance of its modes comes from local fields,
-    unless the number of modes needs them anyway. If ``modes.count`` is "auto", the modes are then counted again.
+    unless the number of modes needs them anyway. Shares for exponentials are compared by what the modes leave of
+    held-out logarithms, without a search. If ``modes.count`` is "auto", the modes are then counted again.
 
     Shapes that are ``related`` are held out together; by default none are. ``among`` are the maps that "auto" compares,
     in the order of their cost. A single one is not compared.
@@ -186,6 +188,9 @@ class _Part(ABC):
     """A map that knows nothing of the shapes of a fold."""
 
     mean: TriangleMesh
+    shapes: FloatArray  # (k, V, 3) of the fold
+    size: float  # distances are shares of it
+    _measured: dict[tuple[int, float], FloatArray] = field(default_factory=dict, init=False)
 
     @cached_property
     @abstractmethod
@@ -200,11 +205,19 @@ class _Part(ABC):
         """Return local fields (n, k, V, 3) that have a share of the variance."""
         return scale_of(self._fields, self._motions, share) * self._fields
 
+    def searched(self, count: int) -> FloatArray:
+        """Return the distances (k,) of the shapes from the nearest shapes of the map, to compare maps."""
+        return self.left(count, 0.0)
+
+    def left(self, count: int, share: float) -> FloatArray:
+        """Return the distances (k,) of the shapes from modes with a share of local fields, to compare shares."""
+        if (count, share) not in self._measured:
+            self._measured[count, share] = self._distances(count, share)
+        return self._measured[count, share]
+
     @abstractmethod
-    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
-        """Return the shapes nearest to the shapes (k, V, 3) of the fold, with a number of modes and a share of local
-        fields.
-        """
+    def _distances(self, count: int, share: float) -> FloatArray:
+        """Measure what ``left`` returns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +233,10 @@ class _LinesPart(_Part):
     def _motions(self) -> FloatArray:
         return self.lines.moved(self._offsets)
 
-    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
+    def _distances(self, count: int, share: float) -> FloatArray:
         lines = self.lines.along(self._offsets, self._local(share)) if share else self.lines
-        return lines.first(count).nearest(shapes).vertices
+        near = lines.first(count).nearest(self.shapes).vertices
+        return vertex_distances(near, self.shapes, self.size).mean(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,9 +250,16 @@ class _ExponentialsPart(_Part):
     def _motions(self) -> FloatArray:
         return self.fields - self.fields.mean(axis=0)
 
-    def nearest(self, shapes: FloatArray, count: int, share: float) -> FloatArray:
-        mean, local = self.mean.vertices, self._local(share) if share else None
-        return nearest_exponentials(self.space, mean, self.fields, self.towards, shapes, count, self.steps, local)
+    def searched(self, count: int) -> FloatArray:
+        mean, towards = self.mean.vertices, self.towards
+        near = nearest_exponentials(self.space, mean, self.fields, towards, self.shapes, count, self.steps)
+        return vertex_distances(near, self.shapes, self.size).mean(axis=1)
+
+    def _distances(self, count: int, share: float) -> FloatArray:
+        # In the tangent space: searches take minutes and choose the same shares (benchmarks/NOTES.md).
+        local = self._local(share) if share else None
+        modes = ModesOfOthers.of(self.space, self.mean.vertices, self.fields, count, local)
+        return np.linalg.norm(modes.left(self.towards), axis=-1).mean(axis=1) / self.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +301,6 @@ class _Comparison:
         self._light = min(LIGHT_STEPS, self._steps)
         self._folds = self._some_related.folds()
         self._parts: dict[tuple[Kind, int], _Part] = {}
-        self._measured: dict[tuple[Kind, int, int, float], FloatArray] = {}
 
     def choice(self) -> GeometryChoice:
         """Compare the maps fold by fold, until the choice is certain."""
@@ -301,7 +321,7 @@ class _Comparison:
             held_out += len(index)
             for each in list(away):
                 with suppress(ModeError, NotPositiveDefiniteError):
-                    found = [self._distances(maps[each], fold, some) for some in counts]
+                    found = [self._part(maps[each], fold).searched(some) for some in counts]
                     away[each] = np.concatenate([away[each], np.mean(found, axis=0)])
                     continue
                 del away[each]
@@ -327,6 +347,7 @@ class _Comparison:
 
     def _map(self, kind: Kind) -> _Map:
         """Return a map of all shapes. Raises ModeError or NotPositiveDefiniteError if it has no mean."""
+        size = self._reference.diagonal
         if kind == "exponential":
             # They must reach enough shapes.
             at = space_of(self._reference, self._some, self._material, self._light, self._first_step, REACHED)
@@ -334,14 +355,15 @@ class _Comparison:
             centre = self._reference.with_vertices(mean)
 
             def exponentials(kept: IntArray, index: IntArray) -> _Part:
-                return _ExponentialsPart(centre, space, fields[kept], fields[index], self._light)
+                held_out, towards = self._some[index], fields[index]
+                return _ExponentialsPart(centre, held_out, size, space, fields[kept], towards, self._light)
 
             return _Map(kind, own, centre, fields.reshape(len(fields), -1), exponentials)
 
-        def straight(kept: IntArray, _: IntArray) -> _Part:
+        def straight(kept: IntArray, index: IntArray) -> _Part:
             others = self._some[kept]
             found = StraightLines.of(kind, others, self._reference, norm="vertices")
-            return _LinesPart(found.reference, found, others)
+            return _LinesPart(found.reference, self._some[index], size, found, others)
 
         lines = StraightLines.of(kind, self._shapes, self._reference, norm="vertices")
         lines.require_mean(self._reference)
@@ -402,23 +424,19 @@ class _Comparison:
         away = np.empty((0, 2))
         for fold, index in enumerate(self._folds):
             few = max(1, min(count, self._some_related.originals - len(index) - 1))
-            both = np.stack([self._distances(chosen, fold, few, each) for each in (share, other)], axis=1)
+            both = np.stack([self._part(chosen, fold).left(few, each) for each in (share, other)], axis=1)
             away = np.concatenate([away, both])
             gaps = away[:, 0] - away[:, 1]
             if len(away) >= ENOUGH and (_certainly_positive(gaps) or _certainly_positive(-gaps)):
                 break
         return away[:, 0], away[:, 1]
 
-    def _distances(self, chosen: _Map, fold: int, count: int, share: float = 0.0) -> FloatArray:
-        """Return distances (k,) of the shapes of a fold from the nearest shapes of a map."""
-        key = chosen.kind, fold, count, share
-        if key not in self._measured:
+    def _part(self, chosen: _Map, fold: int) -> _Part:
+        """Return a map without the shapes of a fold."""
+        if (chosen.kind, fold) not in self._parts:
             index = self._folds[fold]
-            if (chosen.kind, fold) not in self._parts:
-                self._parts[chosen.kind, fold] = chosen.without(self._some_related.without(index), index)
-            near = self._parts[chosen.kind, fold].nearest(self._some[index], count, share)
-            self._measured[key] = vertex_distances(near, self._some[index], self._reference.diagonal).mean(axis=1)
-        return self._measured[key]
+            self._parts[chosen.kind, fold] = chosen.without(self._some_related.without(index), index)
+        return self._parts[chosen.kind, fold]
 
     def _folded(self, lines: StraightLines) -> float:
         """Return the share of random shapes that fold where no training shape has a crease."""

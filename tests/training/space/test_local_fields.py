@@ -16,12 +16,19 @@ from shapespace.training.collection.generators import figure
 from shapespace.training.report.page import write_report
 from shapespace.training.runs.config import parse
 from shapespace.training.runs.settings import ModeSettings
-from shapespace.training.space.codes import box_of
+from shapespace.training.space import geometry
+from shapespace.training.space.codes import box_of, nearest_codes
 from shapespace.training.space.face_coordinates import FaceCoordinates
-from shapespace.training.space.generalisation import PrincipalComponents, vertex_distances
+from shapespace.training.space.generalisation import (
+    ModesOfOthers,
+    PrincipalComponents,
+    space_of,
+    vertex_distances,
+)
 from shapespace.training.space.geometry import choose_geometry, straight_lines
 from shapespace.training.space.held_out import held_out
-from shapespace.training.space.local_fields import WIDTH, local_fields, windows
+from shapespace.training.space.local_fields import WIDTH, local_fields, scale_of, windows
+from shapespace.training.space.logarithms import logarithms
 from shapespace.training.space.related import Related
 from shapespace.training.space.straight_lines import StraightKind, StraightLines
 from shapespace.training.stages.run import execute
@@ -141,6 +148,33 @@ def test_local_fields_come_where_they_help(limbs: tuple[TriangleMesh, FloatArray
     codes = np.random.default_rng(1).uniform(-0.05, 0.05, (20, 3))
     global_ = x + np.einsum("nk,kvj->nvj", codes, np.stack([np.sin(x * k) for k in (1, 2, 3)]))
     assert choose_geometry(ModeSettings(geometry="vertices", count=3), rest, global_, Material()).local_share == 0
+
+
+def test_exponentials_take_local_fields_without_a_search(
+    limbs: tuple[TriangleMesh, FloatArray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What modes leave of held-out logarithms chooses the share, and unseen exponentials come nearer too."""
+    rest, poses = limbs
+    known, unseen = poses[:14], poses[14:18]
+    with monkeypatch.context() as patched:
+        patched.setattr(geometry, "nearest_exponentials", lambda *_: pytest.fail("a search"))
+        auto = ModeSettings(geometry="auto", count=10)
+        choice = choose_geometry(auto, rest, known, Material(), among=("exponential",))
+    assert choice.local_share > 0
+    assert 0.02 < choice.local_gain < 1
+    space, mean, fields = space_of(rest, known, Material(), choice.light_steps, "centred")
+    motions = fields - fields.mean(axis=0)
+    local = local_fields(space.reference, motions)
+    local *= scale_of(local, motions, choice.local_share)
+    towards = logarithms(space, mean, unseen, choice.light_steps).fields
+
+    def error(local: FloatArray | None) -> float:
+        modes = ModesOfOthers.of(space, mean, fields, 10, local)
+        start = modes.codes(towards)
+        near = nearest_codes(space, mean, modes.vertices, unseen, start, choice.light_steps, centre=modes.centre)
+        return float(vertex_distances(near.vertices, unseen, rest.diagonal).mean())
+
+    assert error(local) < 0.95 * error(None)
 
 
 def test_local_fields_bring_further_modes() -> None:
