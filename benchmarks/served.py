@@ -85,7 +85,7 @@ distances from the training shapes.
 
 *Random shapes*: the [specificity](../reference/glossary.md#specificity), ours / of components, for {codes} codes drawn
 evenly from the bounds, in the first fold. A smaller distance is better. Bounds are a tenth wider than the training
-codes need. In the rows named below, which are older, the components [had no such
+codes need. In the figure's row, which is older, the components [had no such
 margin](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), which favours them.
 
 ## How it was measured
@@ -96,8 +96,7 @@ margin](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), which favours them
   factor.
 - `encode` of the exported model got the fine meshes. Simple models come from the same fine meshes. All find codes by
   vertices.
-- Makehuman, hippocampus and the figure with 20 modes were measured before there were [local
-  fields](../explanation/choosing.md#local-fields).
+- The figure with 20 modes was measured before there were [local fields](../explanation/choosing.md#local-fields).
 - No fold chose by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with some of them in view.
 - `python -m benchmarks.served --data FOLDER` trains, measures and writes this page. Figures are in
