@@ -43,23 +43,23 @@ PAGE = """# How many shapes do you need?
 {table}
 
 Each cell has our mean [vertex error](../reference/glossary.md#vertex-error) for {unseen} unseen shapes, in percent of
-the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of as many [principal
+the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of [principal
 components](../reference/glossary.md#principal-component), and to the error of the best of [four simple
-models](generalisation.md#stronger-simple-models). Empty cells: there are too few shapes. {largest}
+models](generalisation.md#stronger-simple-models). Simple models have as many modes as ours, but at most one less than
+shapes: there are no more. Ours adds modes of [local fields](../explanation/choosing.md#few-shapes). Empty cells: there are too few shapes. {largest}
 
 ## What to do with few shapes
 
 - **Choose them far apart.** Each joint should bend in several shapes, alone and with others.
 - **Add mirror images** where left and right may be exchanged (`collection.mirror`). This page has none.
-- **Look at the sliders.** {counts} The last ones come from [local fields](../explanation/choosing.md#few-shapes):
+- **Look at the sliders.** {counts} The last ones come from local fields:
   they move single regions. They can fit an unseen shape, but none of your shapes shows them as a whole.{rises}
 
 ## How it was measured
 
 - Training shapes are drawn at random: {draws}. Figures are means over the draws.
 - Each draw chooses its [map](../explanation/choosing.md#map-from-codes-to-shapes) and its number of modes by itself
-  (see `runs/few-shapes.json`). The simple models have the same coarse meshes and as many modes, but at most one less
-  than shapes: there are no more.
+  (see `runs/few-shapes.json`). All models have the same coarse meshes.
 - Exponentials are exact here. Networks add an error of their own, see [unseen shapes](served.md).
 - `python -m benchmarks.few_shapes --data FOLDER` measures and writes this page. {measured}
 """

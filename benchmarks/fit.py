@@ -294,7 +294,7 @@ def write_page() -> None:
     largest = {
         name: max(np.median(row.errors) / np.median(row.components) for row in rows) for name, rows in unseen.items()
     }
-    farther = [f"{name} (up to {100 * (ratio - 1):.0f} % larger)" for name, ratio in largest.items() if ratio > 1.005]
+    farther = [f"{name} (up to {100 * (ratio - 1):.1f} % larger)" for name, ratio in largest.items() if ratio > 1]
 
     def line(name: str, rows: list[Row]) -> list[str]:
         many, wrong, told, _ = failures(*rows)

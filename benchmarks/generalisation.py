@@ -40,6 +40,11 @@ runs them, see [errors on unseen shapes](served.md). Errors are mean distances o
 The error is {gain} of the error of as many principal components for {better}. For the others
 it is {rest} ([with half of the modes](../../benchmarks/NOTES.md#unseen-shapes-with-half-of-the-modes)).
 
+The modes of the first three tables are exponentials without [local
+fields](../explanation/choosing.md#local-fields). A run with `modes.geometry = "auto"` often chooses another
+[map](../explanation/choosing.md#map-from-codes-to-shapes) for the horse, the dancer (samba) or the bodies (makehuman),
+which has [smaller errors](served.md).
+
 {plain}
 
 ## Stronger simple models

@@ -63,8 +63,9 @@ summary. Errors are mean distances of vertices in percent of the [diagonal](../r
 - After the slash stands the 95th percentile.
 - *Components* are as many principal components. [Ratios](../reference/glossary.md#ratio) below 1 are good.
 - In brackets stand the smallest and the largest ratio of a [fold](../reference/glossary.md#fold).{incomplete}
-- Each run chose its [map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. Each collection has a second
-  model with half of its modes.
+- *Map*: each fold chose its [map](../explanation/choosing.md#map-from-codes-to-shapes) by itself. Two names mean that
+  folds chose differently.
+- Each collection has a second model with half of its modes.
 
 ## Simple models
 
@@ -74,7 +75,9 @@ summary. Errors are mean distances of vertices in percent of the [diagonal](../r
 
 Each figure is the error as a share of the error of principal components. The first column is our model without its
 [memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`). [Modes
-alone](generalisation.md#stronger-simple-models) explains the simple models.
+alone](generalisation.md#stronger-simple-models) explains the simple models, and compares them on coarse meshes. There,
+straight lines of lengths and angles do better. In creased places of the fine horse, dancer and bodies, an angle
+between two faces changes by more than 180° from pose to pose, and no straight line of angles follows that.
 
 ## Training shapes and random shapes
 
@@ -84,9 +87,9 @@ distances from the training shapes.
 {known}
 
 *Random shapes*: the [specificity](../reference/glossary.md#specificity), ours / of components, for {codes} codes drawn
-evenly from the bounds, in the first fold. A smaller distance is better. Bounds are a tenth wider than the training
-codes need. In the figure's row, which is older, the components [had no such
-margin](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), which favours them.
+evenly from the [bounds](../reference/glossary.md#bounds), in the first fold. A smaller distance is better. In the
+figure's row, which is older, the bounds of components [were not
+widened](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), so their distance is a little too small.
 
 ## How it was measured
 
@@ -94,8 +97,8 @@ margin](../../benchmarks/NOTES.md#maps-from-codes-to-shapes), which favours them
   mirror images. {measured}
 - Networks learned from at most {joint} [joint](../reference/glossary.md#joint-code) samples and {factors} of each
   factor.
-- `encode` of the exported model got the fine meshes. Simple models come from the same fine meshes. All find codes by
-  vertices.
+- We gave the fine meshes of the unseen shapes to `encode` of the exported model. Simple models come from the same fine
+  meshes. All find codes by vertices.
 - The figure with 20 modes was measured before there were [local fields](../explanation/choosing.md#local-fields).
 - No fold chose by its own unseen shapes, but we [changed the
   method](../explanation/how-we-know.md#which-choice-was-made-on-which-data) with some of them in view.

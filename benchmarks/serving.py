@@ -165,7 +165,7 @@ def stages(folders: list[Path], count: int) -> None:
     print("\n## A shape as a file\n")
     print(f"A shape takes {ms(min(sums))} to {ms(max(sums))} ms, by model. Reconstruction takes most of the time.")
     print(f"For {slowest}, one code in twenty takes at least {late.pop(slowest):.1f} times the median.", end="")
-    print(f" For the others it is {max(late.values()):.1f} times.\n" if late else "\n")
+    print(f" For the others it is at most {max(late.values()):.1f} times.\n" if late else "\n")
     print(table(("", "p50 / p95 / p99", "full / draft", "without MKL ÷ p50"), tails))
     print("\nA code becomes a GLB of the fine mesh, with [quality](../reference/http.md#quality) `auto`. V is the")
     print("number of coarse vertices. Without [MKL](../reference/glossary.md#blas-mkl), LAPACK solves.")
