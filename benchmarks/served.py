@@ -76,8 +76,8 @@ summary. Errors are mean distances of vertices in percent of the [diagonal](../r
 Each figure is the error as a share of the error of principal components. The first column is our model without its
 [memory](../reference/glossary.md#remembers) of training shapes (`export.examples = false`). [Modes
 alone](generalisation.md#stronger-simple-models) explains the simple models, and compares them on coarse meshes. There,
-straight lines of lengths and angles do better. In creased places of the fine horse, dancer and bodies, an angle
-between two faces changes by more than 180° from pose to pose, and no straight line of angles follows that.
+straight lines of lengths and angles do better. The fine horse, dancer and bodies have creased places. An angle
+between two faces changes by more than 180° from pose to pose there, and no straight line follows that.
 
 ## Training shapes and random shapes
 
