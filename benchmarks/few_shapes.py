@@ -46,8 +46,8 @@ Each cell has our mean [vertex error](../reference/glossary.md#vertex-error) for
 the [diagonal](../reference/glossary.md#diagonal). In brackets stand two ratios: to the error of [principal
 components](../reference/glossary.md#principal-component), and to the error of the best of [four simple
 models](generalisation.md#stronger-simple-models). Simple models have as many modes as ours, but at most one less than
-shapes: there are no more. Ours adds modes of [local fields](../explanation/choosing.md#few-shapes). Empty cells: there are
-too few shapes. {largest}
+shapes: there are no more. Ours adds modes of [local fields](../explanation/choosing.md#few-shapes). Empty cells: there
+are too few shapes. {largest}
 
 ## What to do with few shapes
 
