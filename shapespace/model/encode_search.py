@@ -35,8 +35,9 @@ class EncodeSettings:
     reach: float = 2.5  # a short search is repeated from a training shape at most this many times as far as its result
     known: int = 512  # maximum number of training shapes for restarts
     candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
-    margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it,
-    few: float = 20  # or this number divided by the number of training shapes: few shapes say little about the range
+    # how far outside the bounds a code may lie where ``bounds`` allows it: training shapes say little about the range of
+    # weak modes
+    margin: float = 4.0
     inside: int = 3  # additional shapes for finding a code inside the bounds that is as near
     as_near: float = 1.02  # a code inside the bounds is preferred if its distance is at most this many times as large
 
@@ -74,12 +75,6 @@ class EncodePreparation:
         self.root = np.sqrt(self.norm.squared)
         self.centre = nric(decoder.reference.vertices, decoder.reference.connectivity)  # z̄
 
-    @property
-    def margin(self) -> float:
-        """How far outside the bounds a code may lie, as a share of their width."""
-        codes = self.decoder.training_codes
-        return SETTINGS.margin if codes is None else max(SETTINGS.margin, SETTINGS.few / len(codes))
-
     @cached_property
     def grids(self) -> FactorGrids:
         """Grids of the periodic factors, from which starts are chosen."""
@@ -111,7 +106,7 @@ class EncodeSearch:
     ) -> None:
         self._prepared, self._decoder, self._root = prepared, prepared.decoder, prepared.root
         self._target, self._aim, self._fixed, self._bounds, self._deadline = target, aim, fixed, bounds, deadline
-        self._box = self._box_with(prepared.margin if bounds is not Bounds.CLAMP else 0.0)
+        self._box = self._box_with(0.0 if bounds is Bounds.CLAMP else SETTINGS.margin)
 
     def __call__(self, objective: Objective) -> Fit:
         """Return the best fit by an objective."""
