@@ -35,8 +35,7 @@ class EncodeSettings:
     reach: float = 2.5  # a short search is repeated from a training shape at most this many times as far as its result
     known: int = 512  # maximum number of training shapes for restarts
     candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
-    # how far outside the bounds a code may lie where ``bounds`` allows it: training shapes say little about the range of
-    # weak modes
+    # how far outside the bounds a code may lie where ``bounds`` allows it: few shapes say little about the range
     margin: float = 4.0
     inside: int = 3  # additional shapes for finding a code inside the bounds that is as near
     as_near: float = 1.02  # a code inside the bounds is preferred if its distance is at most this many times as large
