@@ -102,8 +102,8 @@ def test_codes_whose_frames_are_inconsistent_take_few_steps_too() -> None:
     codes = torus.decoder.latents.sample(2600, 7, Distribution.UNIFORM)
     for k in (489, 1860):
         auto, full = (torus.shape(codes[k], mesh=MeshChoice.COARSE, quality=q) for q in (Quality.AUTO, Quality.FULL))
-        assert full.diagnostics.iterations > 50
-        assert auto.diagnostics.iterations <= 4  # 3 or 4, by the processor
+        assert auto.diagnostics.iterations <= 4  # 2 to 4, by the processor
+        assert full.diagnostics.iterations > 10 * auto.diagnostics.iterations  # 50 to 85, by the processor
         assert auto.diagnostics.flipped_faces == 0
         true = exact(torus, codes[k])
         auto_error, full_error = (
