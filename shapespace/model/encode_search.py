@@ -37,7 +37,7 @@ class EncodeSettings:
     candidates: int = 5  # number of nearest training shapes whose lengths and angles are compared
     margin: float = 0.5  # how far outside the bounds a code may lie where ``bounds`` allows it,
     few: float = 20  # or this number divided by the number of training shapes: few shapes say little about the range,
-    far: float = 4.0  # and how far if it is clearly nearer there
+    far: float = 4.0  # or this number for straight lines, which are as exact there as inside
     inside: int = 3  # additional shapes for finding a code inside the bounds that is as near
     as_near: float = 1.02  # a code inside the bounds is preferred if its distance is at most this many times as large
 
@@ -78,8 +78,10 @@ class EncodePreparation:
     @property
     def margin(self) -> float:
         """How far outside the bounds a code may lie, as a share of their width."""
-        codes = self.decoder.training_codes
-        return SETTINGS.margin if codes is None else min(max(SETTINGS.margin, SETTINGS.few / len(codes)), SETTINGS.far)
+        codes, auto = self.decoder.training_codes, self.decoder.auto
+        if auto is not None and auto.tolerance is None:  # drafts are exact: straight lines without Gauss–Newton
+            return SETTINGS.far
+        return SETTINGS.margin if codes is None else max(SETTINGS.margin, SETTINGS.few / len(codes))
 
     @cached_property
     def grids(self) -> FactorGrids:
@@ -124,8 +126,6 @@ class EncodeSearch:
             if self._bounds is not Bounds.CLAMP:
                 fit = self._inside_if_as_near(fit)
             fit = self._from_training_shape_if_nearer(known, near, fit)
-            if self._bounds is not Bounds.CLAMP:
-                fit = self._farther_if_nearer(fit)
         return fit
 
     def difference(self, z: FloatArray) -> FloatArray:
@@ -264,19 +264,6 @@ class EncodeSearch:
             except NotPositiveDefiniteError:
                 return stuck
             return stuck if fit.status is Status.NOT_FINITE else fit
-
-    def _farther_if_nearer(self, fit: Fit) -> Fit:
-        """Return the fit to vertices, or a clearly nearer one beyond the margin, if the search ended at the margin.
-
-        Networks may be wrong there, so no search begins with the whole range.
-        """
-        box = self._box
-        at_margin = (box.lower < box.upper) & ((fit.x <= box.lower) | (fit.x >= box.upper))
-        if not at_margin.any() or fit.status is Status.DEADLINE:
-            return fit
-        other = self._by_vertices(fit, self._box_with(SETTINGS.far))
-        nearer = SETTINGS.as_near * self.away(other.x) < self.away(fit.x)
-        return replace(other if nearer else fit, iterations=fit.iterations + other.iterations)
 
     def _inside_if_as_near(self, fit: Fit) -> Fit:
         """Return the fit to vertices, or an equally near fit inside the bounds, where networks are most accurate."""

@@ -139,8 +139,8 @@ class EncodeOptions(SearchOptions):
     """Options of ``encode``.
 
     Attributes:
-        bounds: ``allow`` accepts a code up to four times the bounds' width outside the bounds, ``clamp`` searches
-            inside the bounds only, ``reject`` refuses a code outside.
+        bounds: ``allow`` accepts a code up to half the bounds' width outside the bounds, or four times for straight
+            lines, ``clamp`` searches inside the bounds only, ``reject`` refuses a code outside.
         objective: what is smallest: ``vertices``, distances after rigid alignment, or ``nric``, differences of lengths
             and angles in their weighted norm.
 
