@@ -82,7 +82,7 @@ def test_a_straight_line_model_is_served_without_training(
             served = model.decode(code)
             expected = align(scale * lines.shape(code)[0], served)
             assert np.abs(served - expected).max() < 1e-4 * size
-        # Shapes say little about the range of codes, so the search goes far outside it.
+        # Straight lines are as exact far outside the bounds as inside, so the search goes there.
         far = run.collection.upper + 3.6 * np.array([0, run.collection.upper[1] - run.collection.lower[1]])
         assert model.encode(model.decode(far)).distances.max() < 1e-3 * size
     code = 0.3 * run.collection.upper
