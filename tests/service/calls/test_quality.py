@@ -100,10 +100,10 @@ def test_without_a_measured_error_auto_is_as_accurate_as_full_shapes_are(model: 
 def test_codes_whose_frames_are_inconsistent_take_few_steps_too() -> None:
     torus = load(ROOT / "models" / "freaky-torus")
     codes = torus.decoder.latents.sample(2600, 7, Distribution.UNIFORM)
-    for k in (489, 1860):
+    for k in (489, 1051):
         auto, full = (torus.shape(codes[k], mesh=MeshChoice.COARSE, quality=q) for q in (Quality.AUTO, Quality.FULL))
-        assert auto.diagnostics.iterations <= 4  # 2 to 4, by the processor
-        assert full.diagnostics.iterations > 10 * auto.diagnostics.iterations  # 50 to 85, by the processor
+        assert full.diagnostics.iterations > 50
+        assert auto.diagnostics.iterations <= 4  # 3 or 4, by the processor
         assert auto.diagnostics.flipped_faces == 0
         true = exact(torus, codes[k])
         auto_error, full_error = (
